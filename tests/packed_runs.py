@@ -7,13 +7,9 @@ import re
 import zipfile
 
 import gymnasium
-import h5py
-import numpy as np
 
 import mjrec
 from mjrec.evidence.compare_descriptions import written_again
-from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.json_text import dumps
 
 
@@ -44,20 +40,14 @@ def unpacked(archive, into):
     return folder
 
 
-def zipped(bag, archive):
-    """Pack a folder, as it is."""
-    with zipfile.ZipFile(archive, "w") as file:
-        for path in _files(bag):
-            file.write(path, f"{bag.name}/{path.relative_to(bag).as_posix()}")
-    return archive
-
-
 def make_bag_fit(bag):
     """Let the lists of a packed run say what is there, whatever that is."""
     sizes = [path.stat().st_size for path in _files(bag / "data")]
     info, count = bag / "bag-info.txt", f"{sum(sizes)}.{len(sizes)}"
     info.write_text(re.sub(r"(?<=Oxum: )[\d.]+", count, info.read_text()))
-    make_manifests_fit(bag)
+    _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
+    tags = (p for p in bag.iterdir() if p.is_file() and p.name[:3] != "tag")
+    _write_manifest(bag, "tagmanifest-sha512.txt", sorted(tags))
 
 
 def describe_again(bag):
@@ -67,17 +57,6 @@ def describe_again(bag):
         for name, text in written_again(bag).items():
             is_tag = (bag / name).exists()
             (bag / name if is_tag else bag / "data" / name).write_text(text)
-
-
-def make_manifests_fit(bag):
-    """Let the manifests alone say it."""
-    _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
-    tags = (
-        path
-        for path in _files(bag)
-        if path.parent == bag and not path.name.startswith("tagmanifest")
-    )
-    _write_manifest(bag, "tagmanifest-sha512.txt", tags)
 
 
 def the(folder, pattern):
@@ -93,28 +72,6 @@ def edit_json(path, edit):
     edit(content)
     indent = 2 if text.startswith("{\n") else None
     path.write_text(dumps(content, indent=indent) + "\n" * text.endswith("\n"))
-
-
-def edit_trajectory(path, edit=lambda _: None, **facts):
-    """Change a finished trajectory: its datasets, its facts; its checksum fits."""
-    if facts:
-        with open_trajectory(path) as reader:
-            reader.facts = {**reader.facts, **facts}
-            write_hdf5(reader, path)
-    with h5py.File(path, "r+") as file:
-        edit(file)
-
-
-def set_reward(path, step, reward):
-    """Change one recorded reward, and the return that the trajectory says."""
-    with open_trajectory(path) as reader:
-        rewards = reader.rewards.copy()
-    rewards[step] = reward
-    edit_trajectory(
-        path,
-        lambda file: file["rewards"].__setitem__(slice(None), rewards),
-        reward=float(np.add.accumulate(rewards)[-1]),
-    )
 
 
 def _write_manifest(bag, name, paths):

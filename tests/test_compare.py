@@ -7,17 +7,11 @@ import struct
 import time
 
 import gymnasium
+import h5py
 import numpy as np
 import pytest
 from imageio.v3 import imwrite
-from packed_runs import (
-    describe_again,
-    edit_json,
-    edit_trajectory,
-    set_reward,
-    the,
-    unpacked,
-)
+from packed_runs import describe_again, edit_json, the, unpacked
 
 import honest_runs
 import mjrec
@@ -25,6 +19,7 @@ from forged_runs import ForgedRun
 from mjrec.evidence.compare import Comparison
 from mjrec.evidence.excuses import note, write_notes
 from mjrec.evidence.findings import Level, Outcome, Topic, Verdict, Verification
+from mjrec.formats.trajectory import added_up
 
 H100 = "NVIDIA H100 80GB HBM3"
 
@@ -86,8 +81,12 @@ def in_details(edit):
     return in_json("*.manifest.json", lambda manifest: edit(manifest["mjrec"]))
 
 
-def in_hdf5(edit=lambda file: None, **facts):
-    return lambda bag: edit_trajectory(the(bag, "*episode000000.h5"), edit, **facts)
+def in_hdf5(edit):
+    def change(bag):
+        with h5py.File(the(bag, "*episode000000.h5"), "r+") as file:
+            edit(file)
+
+    return change
 
 
 def in_states(row, member, add):
@@ -99,8 +98,15 @@ def in_states(row, member, add):
     return in_hdf5(edit)
 
 
+def in_rows(**changes):
+    return lambda bag: ForgedRun(bag / "data/recordings").edit_rows(0, **changes)
+
+
 def another_reward(bag):
-    set_reward(the(bag, "*episode000000.h5"), 2, 9.0)
+    run = ForgedRun(bag / "data/recordings")
+    rewards = run.content(0).rewards.copy()
+    rewards[2] = 9.0
+    run.edit_rows(0, rewards=rewards, facts={"reward": added_up(rewards)})
 
 
 def in_text(pattern, old, new):
@@ -206,7 +212,7 @@ EDITS = [
         in_hdf5(lambda file: file["rewards"].attrs.create("unit", 1)),
         *(Topic.FILES, "attribute unit"),
     ),
-    (in_hdf5(note=1), Topic.PHYSICS, "note"),
+    (in_rows(facts={"note": 1}), Topic.PHYSICS, "note"),
     (in_mp4(slower), Topic.VIDEOS, "times"),
     (in_mp4(lambda c: c.extend(b"\0\0\0\x10uuid12345678")), Topic.VIDEOS, "uuid"),
     (brighter, Topic.PICTURES, "levels in the worst block"),

@@ -13,6 +13,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from functools import partial
+from operator import methodcaller
 
 import gymnasium
 import h5py
@@ -37,6 +38,9 @@ from mjrec.rendering.jobs import RecordingKey
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
 PENDULUM = "InvertedPendulum-v5"
 TURNED = "display_orientation=insert:rotate=180"
+DEVICE = {"index": 0, "note": "all succeeded"}
+SINE = ("-f", "lavfi", "-i", "sine=duration=0.1")
+TITLE = ("-metadata", "title=Success rate 100 %")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Forgery:
 
     what: str
     # Edits a monitor directory before it is packed.
-    lie: Callable = lambda run: None
+    lie: Callable | None = None
     # What is said of it, a regular expression.
     line: str = ""
     # Records the run that is edited.
@@ -64,37 +68,38 @@ def both(*lies):
     return all_of_them
 
 
+def each(count, lie):
+    """Lie of so many episodes."""
+    return both(*(partial(lie, episode=episode) for episode in range(count)))
+
+
 # Lies about numbers.
 
 
-def double_rewards(run, episodes=range(4)):
-    for episode in episodes:
-        run.say_rewards(episode, lambda rewards: 2 * rewards)
+def double_rewards_of(run, episode):
+    run.say_rewards(episode, lambda rewards: 2 * rewards)
 
 
-def leave_states_out(run):
+double_rewards = each(4, double_rewards_of)
+name_another_seed = methodcaller("say", 1, seed=77)
+leave_actions_out = each(4, lambda run, episode: run.edit_rows(episode, action=None))
+call_it_successful = each(4, lambda run, episode: run.say(episode, success=True))
+
+
+def leave_states_out(run, episode):
     """As `pack --episodes` does, but for what that would say in the manifest."""
     facts = {"states_left_out": True, "video": None, "model": None}
     left_out = {"state": None, "snapshot": None, "snapshots": np.empty(0)}
-    for episode in range(4):
-        steps = np.empty(0, np.int64)
-        run.edit_rows(episode, frame_steps=steps, facts=facts, **left_out)
+    run.edit_rows(episode, frame_steps=np.empty(0, np.int64), facts=facts, **left_out)
 
 
-def leave_actions_out(run):
-    for episode in range(4):
-        run.edit_rows(episode, action=None)
-
-
-def call_actions_irregular(run):
-    for episode in range(4):
-        said = [
-            {"episode_id": episode, "step": n, "dtype": "float32", "value": a.tolist()}
-            for n, a in enumerate(run.content(episode).actions)
-        ]
-        run.edit_rows(episode, action=None)
-        lines = [{"action": action} for action in said]
-        run.edit_journal(lambda all_, lines=lines: all_.__setitem__(slice(1, 1), lines))
+def call_actions_irregular(run, episode):
+    lines = [
+        {"action": {"episode_id": episode, "step": n, "dtype": "float32", "value": a}}
+        for n, a in enumerate(run.content(episode).actions.tolist())
+    ]
+    run.edit_rows(episode, action=None)
+    run.edit_journal(lambda all_: all_.__setitem__(slice(1, 1), lines))
 
 
 def repeat_last_states(run):
@@ -139,10 +144,6 @@ def edit_an_action(run):
     run.edit_rows(1, actions=lambda actions: actions.__setitem__(1, -actions[1]))
 
 
-def name_another_seed(run):
-    run.say(1, seed=77)
-
-
 def forget_the_seed(run):
     """Of an episode whose beginning was chosen by hand."""
     run.say(1, seed=None)
@@ -184,7 +185,7 @@ def leave_the_worst_out(run):
 
 
 def leave_the_first_out(run):
-    """And keep the numbers, as if another monitor had recorded before."""
+    """As if another monitor had recorded before."""
     run.remove_episode(0)
     run.edit_details(first_episode_id=1)
     run.edit_journal(lambda lines: lines[0]["run"].update(first_episode_id=1))
@@ -222,6 +223,10 @@ def double_the_return(run):
     run.say(1, reward=2 * added_up(run.content(1).rewards))
 
 
+# What is no plain value is given to no reset, so that nothing is recreated.
+give_no_plain_option = methodcaller("say", 3, options={"note": "version 1.0"})
+
+
 def swap_the_ending(run):
     """A fall is called a limit of time."""
     content = run.content(1)
@@ -232,13 +237,13 @@ def swap_the_ending(run):
 # Lies about videos.
 
 
-def change_pixel(episode, frame, run):
-    frames = [each.copy() for each in run.frames(episode)]
+def change_pixel(run, episode, frame=-1):
+    frames = [one.copy() for one in run.frames(episode)]
     frames[frame][20, 10] ^= 64
     run.film(episode, frames)
 
 
-one_pixel = partial(change_pixel, 1, 2)
+one_pixel = partial(change_pixel, episode=1, frame=2)
 
 
 def negative(run, episode=1, **said):
@@ -286,8 +291,7 @@ def live_and_doctored(run):
     run.edit_rows(1, facts={"video": {"recording": "live"}})
 
 
-def mux(*arguments, **options):
-    return lambda run: run.mux(1, *arguments, **options)
+mux = partial(methodcaller, "mux", 1)
 
 
 def bitstream(filters):
@@ -329,39 +333,25 @@ def hidden_bytes(run):
 
 def encoded_with(arguments):
     """Encode the same frames again, with what only players go by."""
-
-    def lie(run):
-        for episode in (0, 1):
-            run.film(episode, encoder_arguments=("-bsf:v", arguments))
-
-    return lie
+    given = {"encoder_arguments": ("-bsf:v", arguments)}
+    return each(2, lambda run, episode: run.film(episode, **given))
 
 
 # The same frames: only the file, or its times, are others.
 OF_FILES = {
-    "twice the speed, as the metadata says": (
-        lambda run: run.film(1, fps="50", playback_speed=2.0),
-        "",
+    "twice the speed, as the metadata says": methodcaller(
+        "film", 1, fps="50", playback_speed=2.0
     ),
-    "twice the speed, called real time": (swift_in_real_time, ""),
-    "a frame that stands": (bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"), ""),
-    "a second track on top": (second_track, "track|tables"),
-    "a commentary": (
-        mux(
-            *("-f", "lavfi", "-i", "sine=duration=0.1"),
-            *("-map", "0:v", "-map", "1:a", "-c:v", "copy"),
-        ),
-        "track|tables",
-    ),
-    "a title in the file": (
-        mux("-c", "copy", "-metadata", "title=Success rate 100 %", metadata="0"),
-        "",
-    ),
-    "a video turned": (rotation, ""),
-    "wide pixels": (bitstream("h264_metadata=sample_aspect_ratio=4/1"), ""),
+    "twice the speed, called real time": swift_in_real_time,
+    "a frame that stands": bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"),
+    "a second track on top": second_track,
+    "a commentary": mux(*SINE, "-map", "0:v", "-map", "1:a", "-c:v", "copy"),
+    "a title in the file": mux("-c", "copy", *TITLE, metadata="0"),
+    "a video turned": rotation,
+    "wide pixels": bitstream("h264_metadata=sample_aspect_ratio=4/1"),
     # What happens at the right is not shown.
-    "a video cropped": (bitstream("h264_metadata=crop_right=16"), ""),
-    "bytes at the end of a video": (hidden_bytes, ""),
+    "a video cropped": bitstream("h264_metadata=crop_right=16"),
+    "bytes at the end of a video": hidden_bytes,
 }
 
 
@@ -433,8 +423,7 @@ def draft_called_full(run):
 # Lies about what was chosen, and about identity.
 
 
-def replaced(old, new, key=None):
-    return lambda run: run.replace_everywhere(old, new, key=key)
+replaced = partial(methodcaller, "replace_everywhere")
 
 
 def choose_by_hand(run):
@@ -492,15 +481,9 @@ def call_it_trained(run):
     run.edit_journal(lambda lines: lines[0]["run"]["options"].pop("mode", None))
 
 
-def call_it_successful(run):
-    for episode in range(4):
-        run.say(episode, success=True)
-
-
-def call_it_double(run):
+def call_it_double(run, episode):
     """The actions' own dtype is another."""
-    for episode in range(3):
-        run.edit_rows(episode, facts={"action_dtypes": [[0, "float64"]]})
+    run.edit_rows(episode, facts={"action_dtypes": [[0, "float64"]]})
 
 
 # Additions.
@@ -515,11 +498,10 @@ def in_hdf5(edit):
 
 
 def add_to(pattern):
-    return lambda run: run.edit_json(pattern, success_rate=1)
+    return methodcaller("edit_json", pattern, success_rate=1)
 
 
-def add_to_manifest(run):
-    run.edit_details(award="best")
+add_to_manifest = methodcaller("edit_details", award="best")
 
 
 def add_to_facts(key):
@@ -530,11 +512,6 @@ def add_to_facts(key):
             facts[key]["success_rate"] = 1
 
     return lambda run: run.say_everywhere(edit)
-
-
-def name_a_device(run):
-    gl_device = {"index": 0, "note": "all succeeded"}
-    run.edit_json("*.meta.json", gl_device=gl_device)
 
 
 def add_a_video(bag):
@@ -631,13 +608,13 @@ def claim_machine(run):
     run.say_everywhere(edit)
 
 
-def claim_gpu(run):
-    run.edit_json(
-        "*.meta.json",
-        gl_vendor="NVIDIA Corporation",
-        gl_version="4.6.0 NVIDIA 580.95",
-        gl_renderer="NVIDIA H100 80GB HBM3/PCIe/SSE2",
-    )
+claim_gpu = methodcaller(
+    "edit_json",
+    "*.meta.json",
+    gl_vendor="NVIDIA Corporation",
+    gl_version="4.6.0 NVIDIA 580.95",
+    gl_renderer="NVIDIA H100 80GB HBM3/PCIe/SSE2",
+)
 
 
 def claim_ffmpeg(run):
@@ -664,6 +641,10 @@ CLAIMS = {
     "another ffmpeg": claim_ffmpeg,
     "a wrapper": claim_wrapper,
 }
+
+
+FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
+OF_NOTHING = ("environment", "1.0")
 
 
 # What is recorded, and packed.
@@ -730,29 +711,19 @@ QUICK = {
 EDITED = {
     "rewards doubled": (double_rewards, "reward"),
     **{
-        f"rewards doubled, {how}": (both(double_rewards, lie), line)
-        for how, lie, line in (
-            *((f"with {claim} claimed", CLAIMS[claim], "") for claim in CLAIMS),
-            ("states left out", leave_states_out, "reward"),
-            ("actions left out of an evaluation", leave_actions_out, ""),
-            ("actions called irregular", call_actions_irregular, "reward"),
+        f"rewards doubled, {how}": (both(double_rewards, lie), "reward")
+        for how, lie in (
+            *((f"with {claim} claimed", CLAIMS[claim]) for claim in FALSE_CLAIMS),
+            ("states left out", each(4, leave_states_out)),
+            ("actions left out of an evaluation", leave_actions_out),
+            ("actions called irregular", each(4, call_actions_irregular)),
             # No package is called so, but an excuse is.
-            (
-                "with a version of the environment claimed",
-                claim_version("environment", "1.0"),
-                "reward",
-            ),
-            # Nothing is recreated of a reset that cannot be given its options.
-            (
-                "with an option that no reset can be given",
-                lambda run: run.say(3, options={"note": "version 1.0"}),
-                "",
-            ),
+            ("with a version of the environment claimed", claim_version(*OF_NOTHING)),
+            ("with an option that no reset can be given", give_no_plain_option),
         )
-        if lie is not claim_wrapper
     },
     **{
-        f"{what}, with a wrapper claimed": (both(lie, claim_wrapper), "")
+        f"{what}, with a wrapper claimed": both(lie, claim_wrapper)
         for what, lie in (
             ("a state of an ulp", edit_a_state),
             ("another seed", name_another_seed),
@@ -766,40 +737,39 @@ EDITED = {
     ),
     "success added to the journal": (call_it_successful, "success"),
     "last states called unknown": (repeat_last_states, "state"),
-    "cut before the fall": (cut, ""),
-    "cut before the fall, called a limit": (cut_as_by_a_limit, ""),
+    "cut before the fall": cut,
+    "cut before the fall, called a limit": cut_as_by_a_limit,
     "a state of an ulp": (edit_a_state, "qpos|qvel|states"),
-    "an action edited": (edit_an_action, ""),
-    "another seed": (name_another_seed, ""),
-    "a beginning of one's own, its seed forgotten": (forget_the_seed, ""),
-    "two episodes in the other order": (swap_episodes, ""),
-    "one episode shown as two": (lambda run: show_one_as_two(run, seed=99), ""),
-    "the worst left out, the others renumbered": (leave_the_worst_out, ""),
+    "an action edited": edit_an_action,
+    "another seed": name_another_seed,
+    "a beginning of one's own, its seed forgotten": forget_the_seed,
+    "two episodes in the other order": swap_episodes,
+    "one episode shown as two": lambda run: show_one_as_two(run, seed=99),
+    "the worst left out, the others renumbered": leave_the_worst_out,
     "the first left out": (leave_the_first_out, "begins with episode 1"),
     "fall called a limit of time": (swap_the_ending, "terminated|truncated"),
     # Videos.
     "one pixel changed": (one_pixel, "frame 2"),
     **{
-        f"one pixel changed, with {name} claimed": (both(one_pixel, claim), "")
+        f"one pixel changed, with {name} claimed": both(one_pixel, claim)
         for name, claim in CLAIMS.items()
     },
     "a pixel of each video changed, with another ffmpeg claimed": (
-        both(*(partial(change_pixel, n, -1) for n in (0, 1)), claim_ffmpeg),
+        both(each(2, change_pixel), claim_ffmpeg),
         "hash",
     ),
     "the fall not shown": (hide_the_fall, "frames"),
     "a frame doubled": (double_a_frame, "frames"),
     "a frame replaced": (refilm(lambda f: [*f[:2], f[1], *f[3:]]), "frame 2"),
-    "videos swapped": (swap_videos, ""),
-    "a negative called a clip": (negative_as_clip, ""),
-    "a negative called live": (live_and_doctored, ""),
+    "videos swapped": swap_videos,
+    "a negative called a clip": negative_as_clip,
+    "a negative called live": live_and_doctored,
     **OF_FILES,
+    "a second track on top": (second_track, "track|tables"),
+    "a commentary": (OF_FILES["a commentary"], "track|tables"),
     **{
-        f"{what}, with another ffmpeg claimed": (both(lie, claim_ffmpeg), "")
-        for what, lie in (
-            *((what, lie) for what, (lie, _) in OF_FILES.items()),
-            ("a frame doubled", double_a_frame),
-        )
+        f"{what}, with another ffmpeg claimed": both(lie, claim_ffmpeg)
+        for what, lie in (*OF_FILES.items(), ("a frame doubled", double_a_frame))
     },
     **{
         what: (both(encoded_with(f"h264_metadata={said}"), claim_ffmpeg), line)
@@ -809,29 +779,25 @@ EDITED = {
             ("videos turned in the stream", TURNED, "frame"),
         )
     },
-    "negatives of all videos, with another GPU claimed": (
-        both(lambda run: negative(run, 0), negative, claim_gpu),
-        "",
+    "negatives of all videos, with another GPU claimed": both(
+        each(2, negative), claim_gpu
     ),
-    "videos swapped, with another GPU claimed": (both(swap_videos, claim_gpu), ""),
-    "small frames called large": (refilm(lambda f: [*map(scaled_up, f)]), ""),
-    "draft called full": (draft_called_full, ""),
-    "a close-up added": (add_a_close_up, ""),
+    "videos swapped, with another GPU claimed": both(swap_videos, claim_gpu),
+    "small frames called large": refilm(lambda f: [*map(scaled_up, f)]),
+    "draft called full": draft_called_full,
+    "a close-up added": add_a_close_up,
     "a video called broken": (call_it_broken, "no such file"),
     "a video left out, the schedule blamed": (blame_the_schedule, "no such"),
     # What was chosen, and identity.
-    "another schedule named": (
-        replaced("capped_cubic_video_schedule", "every:2"),
-        "",
-    ),
-    "a scheduled video left out": (choose_by_hand, ""),
-    "another environment named": (replaced(PENDULUM, "Hopper-v5"), ""),
+    "another schedule named": replaced("capped_cubic_video_schedule", "every:2"),
+    "a scheduled video left out": choose_by_hand,
+    "another environment named": replaced(PENDULUM, "Hopper-v5"),
     # In what people read; it is made by its own id.
-    "another name": (replaced(PENDULUM, "Humanoid-v5", "env_id"), "its name is"),
-    "called one's own environment": (replaced(PENDULUM, "MyPendulum-v0"), ""),
-    "called gym's": (pretend_to_be_gym, ""),
+    "another name": (replaced(PENDULUM, "Humanoid-v5", key="env_id"), "its name is"),
+    "called one's own environment": replaced(PENDULUM, "MyPendulum-v0"),
+    "called gym's": pretend_to_be_gym,
     "a second file in a model's sources": (put_another_model_before, "zip"),
-    "evaluation called training": (call_it_trained, ""),
+    "evaluation called training": call_it_trained,
     # Claims without a lie.
     "another MuJoCo claimed": (CLAIMS["another MuJoCo"], "is claimed to be"),
     "another GPU claimed": (claim_gpu, "is claimed to be"),
@@ -841,7 +807,7 @@ EDITED = {
     ),
     # Additions.
     "a dataset added": (
-        in_hdf5(lambda f: f.create_dataset("success", (3,))),
+        in_hdf5(lambda file: file.create_dataset("success", data=np.ones(3))),
         "success",
     ),
     "an attribute added": (
@@ -852,7 +818,10 @@ EDITED = {
     "a key in the statistics": (add_to("*.stats.json"), "success_rate"),
     "a key in metadata": (add_to("*000001.meta.json"), "success_rate"),
     "a key in the manifest": (add_to_manifest, "award"),
-    "a key about the device": (name_a_device, "gl_device"),
+    "a key about the device": (
+        methodcaller("edit_json", "*.meta.json", gl_device=DEVICE),
+        "gl_device",
+    ),
     "a key of the provenance": (add_to_facts("provenance"), "success_rate"),
     "a key of the machine": (add_to_facts("machine"), "success_rate"),
     "a line in the journal": (add_a_line, "remark"),
@@ -861,8 +830,8 @@ EDITED = {
 
 # Of the usual run, when it was packed; the lists of the bag are made to fit.
 PACKED = {
-    "the worst's video called pending": (pending_worst, ""),
-    "a video called made smaller": (say_it_was_made_smaller, ""),
+    "the worst's video called pending": pending_worst,
+    "a video called made smaller": say_it_was_made_smaller,
     "a line about rows": (add_a_line_about_rows, "goals"),
     "a note beside the data": (add_a_file("notes.txt"), "notes.txt"),
     "a note in the data": (add_a_file("data/notes.txt"), "notes.txt"),
@@ -902,103 +871,85 @@ PACKED = {
 # Recorded of an environment that is not what its name says.
 DOCTORED = {
     "rewards doubled by a wrapper that is not named": (lying.double_reward, "reward"),
-    "falls that do not end an episode": (lying.never_fall, ""),
-    "a pole that is held": (lying.push, ""),
-    "a heavier robot": (lying.make_heavy, ""),
-    "played on the moon": (lying.raise_gravity, ""),
-    "every episode a success": (lying.always_succeed, ""),
-    "a body made invisible": (lying.hide_the_pole, ""),
+    "falls that do not end an episode": lying.never_fall,
+    "a pole that is held": lying.push,
+    "a heavier robot": lying.make_heavy,
+    "played on the moon": lying.raise_gravity,
+    "every episode a success": lying.always_succeed,
+    "a body made invisible": lying.hide_the_pole,
 }
 
-FORGERIES = (
-    *(Forgery(what, lie, line) for what, (lie, line) in EDITED.items()),
-    *(Forgery(what, bag=bag, line=line) for what, (bag, line) in PACKED.items()),
-    *(
-        Forgery(what, of=doctored(change), line=line)
-        for what, (change, line) in DOCTORED.items()
+# Of other runs.
+OTHERS = {
+    "rewards doubled of an episode that was cut off": (
+        *(honest.early, double_rewards_cut_off, "reward"),
     ),
+    "rewards doubled of an episode whose encoder was killed": (
+        *(honest.encoder_killed, partial(double_rewards_of, episode=1), "reward"),
+    ),
+    "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
+    "the best called the worst": (best, replaced("best:1", "worst:1"), ""),
+    "the worst of an evaluation called its best": (evaluated_and_swapped, None, ""),
+    "arguments hidden": (noiseless, hide_arguments, ""),
+    "another model's sources": (honest.mjcf, swap_the_model, ""),
+    "a key in the manifest, with a schedule of one's own": (
+        *(by_hand, add_to_manifest, "award"),
+    ),
+}
+
+# What is no proof of a lie, with what is said of it.
+BELIEVED = {
     # It could have been there: this is what a wrapper may do.
-    Forgery(
-        "rewards doubled, with a wrapper claimed",
-        both(double_rewards, claim_wrapper),
+    "rewards doubled, with a wrapper claimed": (
+        *(honest.pendulum, both(double_rewards, claim_wrapper)),
         r"rewards .* \[wrappers\]",
-        verdict=PARTLY,
     ),
-    Forgery(
-        "an action edited, with a wrapper claimed",
-        both(edit_an_action, claim_wrapper),
+    "an action edited, with a wrapper claimed": (
+        *(honest.pendulum, both(edit_an_action, claim_wrapper)),
         r"not its controls.* \[wrappers\]",
-        verdict=PARTLY,
     ),
-    Forgery(
-        "cut before the fall, with a wrapper claimed",
-        both(cut_as_by_a_limit, claim_wrapper),
-        verdict=PARTLY,
+    "cut before the fall, with a wrapper claimed": (
+        *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper), ""),
     ),
-    Forgery(
-        "one episode shown as two, with its seed",
-        show_one_as_two,
-        "same episode",
-        verdict=PARTLY,
+    "one episode shown as two, with its seed": (
+        *(honest.pendulum, show_one_as_two, "same episode"),
     ),
-    Forgery("one recording shown as two", copy_the_recording, "same", verdict=PARTLY),
-    Forgery(
-        "closed whenever an episode goes wrong, and resumed",
-        of=close_and_go_on,
-        line="continues after them",
-        verdict=PARTLY,
+    "one recording shown as two": (honest.pendulum, copy_the_recording, "same"),
+    "closed whenever an episode goes wrong, and resumed": (
+        *(close_and_go_on, None, "continues after them"),
     ),
     # The returns of such an episode count, and the first lines name it.
-    Forgery(
-        "the encoder killed before the fall",
-        of=honest.encoder_killed,
-        line=r"faults while recording.* video of episode 1(.|\n)*\[broken video\]",
-        verdict=PARTLY,
+    "the encoder killed before the fall": (
+        *(honest.encoder_killed, None),
+        r"faults while recording.* video of episode 1(.|\n)*\[broken video\]",
     ),
-    # Where nothing need differ, nothing was excused.
+}
+
+# Where nothing need differ, nothing was excused.
+HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg")
+
+
+def rows(table):
+    """Yield what, how, and what is said of it, if that is given."""
+    for what, given in table.items():
+        yield (what, *(given if isinstance(given, tuple) else (given, "")))
+
+
+FORGERIES = (
+    *(Forgery(what, lie, line) for what, lie, line in rows(EDITED)),
+    *(Forgery(what, bag=bag, line=line) for what, bag, line in rows(PACKED)),
+    *(Forgery(w, of=doctored(change), line=line) for w, change, line in rows(DOCTORED)),
     *(
-        Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS)
-        for name in ("another Gymnasium", "another machine", "another ffmpeg")
+        Forgery(what, lie, line, of=of, verdict=verdict)
+        for verdict, forgeries in ((FAIL, OTHERS), (PARTLY, BELIEVED))
+        for what, (of, lie, line) in forgeries.items()
     ),
-    # Other runs, and other ways to pack.
+    *(Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS) for name in HARMLESS),
     *(
-        Forgery(f"rewards doubled{how}", double_rewards, "reward", packing=packing)
+        Forgery(f"rewards doubled, {how}", double_rewards, "reward", packing=packing)
         for how, packing in (
-            (", of episodes that were not chosen for packing", {"episodes": [0]}),
-            (", anonymously", {"anonymous": True}),
-        )
-    ),
-    *(
-        Forgery(what, lie, line, of=of)
-        for what, lie, line, of in (
-            (
-                "rewards doubled of an episode that was cut off",
-                double_rewards_cut_off,
-                "reward",
-                honest.early,
-            ),
-            (
-                "rewards doubled of an episode whose encoder was killed",
-                lambda run: double_rewards(run, [1]),
-                "reward",
-                honest.encoder_killed,
-            ),
-            ("actions called float64", call_it_double, "", honest.cheetah),
-            ("the best called the worst", replaced("best:1", "worst:1"), "", best),
-            (
-                "the worst of an evaluation called its best",
-                lambda run: None,
-                "",
-                evaluated_and_swapped,
-            ),
-            ("arguments hidden", hide_arguments, "", noiseless),
-            ("another model's sources", swap_the_model, "", honest.mjcf),
-            (
-                "a key in the manifest, with a schedule of one's own",
-                add_to_manifest,
-                "award",
-                by_hand,
-            ),
+            ("of episodes that were not chosen for packing", {"episodes": [0]}),
+            ("anonymously", {"anonymous": True}),
         )
     ),
     Forgery(
@@ -1040,7 +991,8 @@ def recorded(tmp_path_factory):
 def forged(forgery, run, into):
     """Return a forged archive, or an unpacked one."""
     directory = shutil.copytree(run, into / "recorded")
-    forgery.lie(ForgedRun(directory))
+    if forgery.lie is not None:
+        forgery.lie(ForgedRun(directory))
     archive = mjrec.pack(directory, into / "run.zip", **forgery.packing)
     if forgery.bag is None:
         return archive
