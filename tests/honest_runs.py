@@ -15,7 +15,8 @@ from mjrec.environments.mjcf_environments import MjcfEnvironment
 from mjrec.trackers import Tracker
 
 _SMALL = {"render_mode": "rgb_array", "width": 32, "height": 32}
-_POLE = "InvertedPendulum-v5"
+_POLE, _CHEETAH = "InvertedPendulum-v5", "HalfCheetah-v5"
+_PUSH = np.full(1, 0.1, np.float32)
 
 _ROBOT = """
 <mujoco>
@@ -47,42 +48,45 @@ def play(env, episodes, *, seed=lambda episode: episode, most=20, kind=np.float3
                     break
 
 
-def pendulum(directory, episodes=4, *, longest=5, **options):
+def _made(env_id=_POLE, longest=5, **options):
+    return gymnasium.make(env_id, max_episode_steps=longest, **{**_SMALL, **options})
+
+
+def _monitored(env, directory, **options):
+    usual = {"mode": "evaluation", "workers": 1}
+    return mjrec.Monitor(env, directory, **{**usual, **options})
+
+
+def pendulum(directory, episodes=4, *, longest=5, make=(), **options):
     """Record evaluated episodes that end by a fall or after five steps."""
-    make = {**_SMALL, **options.pop("make", {})}
-    env = gymnasium.make(_POLE, max_episode_steps=longest, **make)
-    options = {"mode": "evaluation", "uid": "u", "workers": 1, **options}
-    play(mjrec.Monitor(env, directory, **options), episodes)
+    env = _made(longest=longest, **dict(make))
+    play(_monitored(env, directory, **{"uid": "u", **options}), episodes)
 
 
 def cheetah(directory, **options):
     """Record an environment that never falls, with one seed at the first reset."""
-    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
-    monitor = mjrec.Monitor(env, directory, workers=1, mode="evaluation", **options)
+    monitor = _monitored(_made(_CHEETAH, 4), directory, **options)
     play(monitor, 3, seed=lambda episode: None if episode else 7)
 
 
-def suite(directory, **options):
+def suite(directory):
     """Record a task of dm_control's suite."""
     tasks = pytest.importorskip("dm_control.suite")
     given = {"random": 3, "time_limit": 0.04}
     env = tasks.load("cartpole", "balance", task_kwargs=given)
-    options = {"mode": "evaluation", "env_id": "dm_control/cartpole-balance", **options}
-    monitor = mjrec.Monitor(env, directory, workers=1, width=32, height=32, **options)
+    options = {"env_id": "dm_control/cartpole-balance", "width": 32, "height": 32}
     generator = np.random.default_rng(3)
-    with contextlib.closing(monitor):
+    with contextlib.closing(_monitored(env, directory, **options)) as monitor:
         for _ in range(2):
             monitor.reset()
             for _ in range(4):
                 monitor.step(generator.uniform(-1, 1, monitor.action_spec().shape))
 
 
-def vector(directory, **options):
+def vector(directory):
     """Record one of two environments that reset themselves."""
-    env = gymnasium.make_vec(
-        _POLE, 2, vectorization_mode="sync", max_episode_steps=4, **_SMALL
-    )
-    monitor = mjrec.Monitor(env, directory, mode="evaluation", workers=1, **options)
+    options = {"vectorization_mode": "sync", "max_episode_steps": 4, **_SMALL}
+    monitor = _monitored(gymnasium.make_vec(_POLE, 2, **options), directory)
     monitor.reset(seed=3)
     for _ in range(12):
         monitor.step(np.zeros(monitor.action_space.shape, np.float32))
@@ -92,38 +96,35 @@ def vector(directory, **options):
 def evaluated(directory, **options):
     """Evaluate episodes in several chunks, whose videos are chosen among all."""
     given = {"policy": "random", "num_seeds": 3, "keep": "best,failures"}
-    given |= {"max_steps": 4, **options}
-    mjrec.evaluate(
-        [_POLE],
-        directory=directory,
-        episodes=1,
-        height=32,
-        width=32,
-        workers=1,
-        **given,
-    )
+    given |= {"max_steps": 4, "height": 32, "width": 32, "workers": 1, **options}
+    mjrec.evaluate([_POLE], directory=directory, episodes=1, **given)
+
+
+def _die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _raise(*_):
+    raise ValueError("it is on the right")
+
+
+def _evaluated_until_right(directory, end):
+    def policy(observation):
+        if observation[0] > 0:
+            end()
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
 
 
 def evaluated_in_part(directory):
     """Evaluate a policy that raises in some episodes."""
-
-    def policy(observation):
-        if observation[0] > 0:
-            raise ValueError("it is on the right")
-        return np.zeros(1, np.float32)
-
-    evaluated(directory, policy=policy)
+    _evaluated_until_right(directory, _raise)
 
 
 def evaluated_to_death(directory):
     """Evaluate a policy that kills its process in some episodes."""
-
-    def policy(observation):
-        if observation[0] > 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return np.zeros(1, np.float32)
-
-    evaluated(directory, policy=policy)
+    _evaluated_until_right(directory, _die)
 
 
 def evaluated_again(directory):
@@ -133,7 +134,7 @@ def evaluated_again(directory):
     def policy(observation):
         calls.append(observation)
         if len(calls) == 7:
-            os.kill(os.getpid(), signal.SIGKILL)
+            _die()
         return np.zeros(1, np.float32)
 
     evaluated(directory, policy=policy)
@@ -147,11 +148,7 @@ def extended(directory):
 
 def clips(directory):
     """Record clips of four steps, which cross episodes."""
-    pendulum(directory, step_trigger=_every_sixth, video_length=4)
-
-
-def _every_sixth(step):
-    return step % 6 == 0
+    pendulum(directory, step_trigger=lambda step: step % 6 == 0, video_length=4)
 
 
 def kept(directory, *, rule="worst:1"):
@@ -185,16 +182,12 @@ def killed(directory):
     """Record in a process that is killed in its third episode, and finish that."""
     child = os.fork()
     if child == 0:
-        env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
-        monitor = mjrec.Monitor(env, directory, uid="u", mode="evaluation", workers=1)
-        for episode in range(3):
+        monitor = _monitored(_made(), directory, uid="u")
+        for episode, steps in enumerate((5, 5, 2)):
             monitor.reset(seed=episode)
-            for _ in range(3 if episode < 2 else 2):
-                monitor.step(np.full(1, 0.1, np.float32))
-            if episode < 2:
-                monitor.step(np.full(1, 0.1, np.float32))
-                monitor.step(np.full(1, 0.1, np.float32))
-        os.kill(os.getpid(), signal.SIGKILL)
+            for _ in range(steps):
+                monitor.step(_PUSH)
+        _die()
     os.waitpid(child, 0)
     # The worker of the killed process may still be drawing.
     mjrec.recover(directory, timeout=60)
@@ -203,32 +196,25 @@ def killed(directory):
 
 def unseeded(directory):
     """Record episodes whose beginning nothing leads to."""
-    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
-    monitor = mjrec.Monitor(env, directory, mode="evaluation", workers=1)
-    play(monitor, 2, seed=lambda _: None)
+    play(_monitored(_made(), directory), 2, seed=lambda _: None)
 
 
 def early(directory):
     """Record an episode that a reset cut off."""
-    env = gymnasium.make(_POLE, max_episode_steps=9, **_SMALL)
-    monitor = mjrec.Monitor(
-        env, directory, mode="evaluation", workers=1, allow_early_reset=True
-    )
-    play(monitor, 3, most=2)
+    play(_monitored(_made(longest=9), directory, allow_early_reset=True), 3, most=2)
 
 
 def wrapped(directory):
     """Record with wrappers of Gymnasium's own between monitor and environment."""
-    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    env = _made(_CHEETAH, 4)
     env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+    play(_monitored(env, directory), 2)
 
 
 def wrapped_in_code(directory):
     """Record with a wrapper that only its author has."""
-    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
-    env = gymnasium.wrappers.TransformReward(env, lambda reward: 2 * reward)
-    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+    env = gymnasium.wrappers.TransformReward(_made(_CHEETAH, 4), lambda r: 2 * r)
+    play(_monitored(env, directory), 2)
 
 
 class _Away(Tracker):
@@ -260,24 +246,19 @@ def trigger_raises(directory):
 
 def encoder_killed(directory):
     """Record on when the encoder of a live video was killed in the second episode."""
-    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
-    monitor = mjrec.Monitor(
-        env, directory, mode="evaluation", render="live", on_error="warn"
-    )
-    with monitor:
+    with _monitored(_made(), directory, render="live", on_error="warn") as monitor:
         for episode in range(2):
             monitor.reset(seed=episode)
             for step in range(5):
                 if (episode, step) == (1, 2):
                     kill_children("ffmpeg")
-                monitor.step(np.full(1, 0.1, np.float32))
+                monitor.step(_PUSH)
 
 
 def frame_missing(directory):
     """Record on when `render` has raised in the second episode of a live recording."""
-    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
-    draw = env.unwrapped.render
-    drawn = iter([*range(5), None])
+    env = _made()
+    draw, drawn = env.unwrapped.render, iter([*range(5), None])
 
     def render():
         if next(drawn, 0) is None:
@@ -285,16 +266,13 @@ def frame_missing(directory):
         return draw()
 
     vars(env.unwrapped)["render"] = render
-    monitor = mjrec.Monitor(
-        env, directory, mode="evaluation", render="live", on_error="warn"
-    )
-    play(monitor, 2)
+    play(_monitored(env, directory, render="live", on_error="warn"), 2)
 
 
 def text(directory):
     """Record an environment that draws with letters."""
     env = gymnasium.make("Taxi-v4", render_mode="ansi", max_episode_steps=3)
-    with mjrec.Monitor(env, directory, mode="evaluation") as monitor:
+    with _monitored(env, directory) as monitor:
         for seed in range(2):
             monitor.reset(seed=seed)
             for action in (0, 1, 2):
@@ -306,7 +284,7 @@ def mjcf(directory):
     path = directory.with_name("robot.xml")
     path.write_text(_ROBOT)
     env = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path, width=32, height=32), 4)
-    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+    play(_monitored(env, directory), 2)
 
 
 def training(directory):
@@ -316,25 +294,12 @@ def training(directory):
 
 def doubles(directory):
     """Record actions in float64."""
-    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
-    play(
-        mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2, kind=np.float64
-    )
+    play(_monitored(_made(_CHEETAH, 4), directory), 2, kind=np.float64)
 
 
 def views(directory):
     """Record from another camera, at another size and rate, with the observations."""
-    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=6, **_SMALL)
-    monitor = mjrec.Monitor(
-        env,
-        directory,
-        mode="evaluation",
-        workers=1,
-        camera=[{"azimuth": 70.0, "distance": 3.0}, "track", -1],
-        width=48,
-        height=32,
-        max_fps=10,
-        observations=True,
-        video_callable=lambda episode: episode == 1,
-    )
-    play(monitor, 2)
+    options = {"width": 48, "height": 32, "max_fps": 10, "observations": True}
+    options["camera"] = [{"azimuth": 70.0, "distance": 3.0}, "track", -1]
+    options["video_callable"] = lambda episode: episode == 1
+    play(_monitored(_made(_CHEETAH, 6), directory, **options), 2)
