@@ -128,7 +128,7 @@ def driver(place, engine, **environ):
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ},
         start_new_session=True,
     ) as process:
-        wait_until(lambda: lines(place / "begun"), seconds=60)
+        wait_until(lambda: lines(place / "begun"), seconds=120)
         yield process
 
 
