@@ -8,12 +8,8 @@ from _pytest.mark import ParameterSet
 def parametrize(names, cases, *, default=1, part=pytest.mark.thorough, **options):
     """Do what `pytest.mark.parametrize` does, and mark what only `--all` runs.
 
-    Args:
-        names: of the arguments.
-        cases: their values.
-        default: how many of the first cases the default run tries, or which.
-        part: the marker of the others.
-        **options: of `pytest.mark.parametrize`.
+    `default` is how many of the first cases the default run tries, or which; `part` is
+    the marker of the others.
     """
     cases = list(cases)
     if cases and not isinstance(default, int) and all(c not in default for c in cases):
