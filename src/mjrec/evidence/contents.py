@@ -208,7 +208,7 @@ def _check_is_idle(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    monitors = monitors_of(directory)
+    monitors = list(monitors_of(directory))
     killed = [each.infix for each in monitors if has_leftovers(each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))

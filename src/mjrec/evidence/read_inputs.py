@@ -83,7 +83,7 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     arrays: dict[str, NDArray[Any]] = {}
     try:
         packing = _packing(data / ENVIRONMENT)
-        monitors = monitors_of(data / RECORDINGS)
+        monitors = list(monitors_of(data / RECORDINGS))
         strays = [files for files in monitors if packing and files.manifest is None]
         if strays:
             name = strays[0].paths[0].name

@@ -82,15 +82,16 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     if not directory.is_dir():
         logger.error("The directory %s does not exist.", directory)
         return None
-    monitors = [
-        each for each in monitors_of(directory) if each.manifest or each.journal
+    kept = [
+        _kept(MonitorResults(files))
+        for files in monitors_of(directory)
+        if files.manifest or files.journal
     ]
-    if not monitors:
+    if not kept:
         logger.error("There are no manifests or journals in %s.", directory)
         return None
     # In the order of the manifests' names, as in gym.
-    monitors.sort(key=lambda files: f"{files.infix}.manifest.json")
-    kept = [_kept(MonitorResults(files)) for files in monitors]
+    kept.sort(key=lambda each: f"{each.infix}.manifest.json")
     found = {
         "manifests": [each.path for each in kept],
         "env_info": _env_info(directory, kept),
@@ -112,6 +113,7 @@ def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
 class _Kept(NamedTuple):
     """The part of a monitor's results that is kept in memory while merging."""
 
+    infix: str
     path: str
     stats: StatsFile
     env_info: Mapping[str, Any] | None
@@ -120,6 +122,7 @@ class _Kept(NamedTuple):
 
 def _kept(results: MonitorResults) -> _Kept:
     return _Kept(
+        infix=results.files.infix,
         path=str(results.files.manifest or results.files.journal),
         stats=results.stats(),
         env_info=results.env_info,

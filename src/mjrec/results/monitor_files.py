@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from ..errors import DirectoryInUse
@@ -109,20 +109,26 @@ class MonitorFiles:
             self.trajectories[number] = path
 
 
-def monitors_of(directory: Path) -> list[MonitorFiles]:
-    """Return each monitor's files, including hidden ones, sorted by infix.
+def monitors_of(directory: Path) -> Iterator[MonitorFiles]:
+    """Return an iterator over each monitor's files, including hidden ones, by infix.
 
     Trajectories include the files that recordings in flight will become. Monitors that
     have only a lock or an unfinished file are included.
     """
     files, in_flight = (
-        _by_infix(iter_monitor_files(directory, hidden=True)),
-        _by_infix(recording.path for recording in recordings_in_flight(directory)),
+        _by_infix(path.name for path in iter_monitor_files(directory, hidden=True)),
+        _by_infix(each.path.name for each in recordings_in_flight(directory)),
     )
-    return [
-        MonitorFiles(infix, files.get(infix, ()), in_flight.get(infix, ()))
+    # There may be a hundred thousand files, and a path takes much more memory than a
+    # name.
+    return (
+        MonitorFiles(
+            infix,
+            map(directory.joinpath, files.get(infix, ())),
+            map(directory.joinpath, in_flight.get(infix, ())),
+        )
         for infix in sorted({*files, *in_flight}, key=infix_order)
-    ]
+    )
 
 
 def files_of(directory: Path, infix: str) -> MonitorFiles:
@@ -136,11 +142,11 @@ def files_of(directory: Path, infix: str) -> MonitorFiles:
     return MonitorFiles(infix, paths, in_flight)
 
 
-def _by_infix(paths: Iterable[Path]) -> dict[str, list[Path]]:
-    grouped: dict[str, list[Path]] = {}
-    for path in paths:
-        if (infix := infix_of(path.name)) is not None:
-            grouped.setdefault(infix, []).append(path)
+def _by_infix(names: Iterable[str]) -> dict[str, list[str]]:
+    grouped: dict[str, list[str]] = {}
+    for name in names:
+        if (infix := infix_of(name)) is not None:
+            grouped.setdefault(infix, []).append(name)
     return grouped
 
 
