@@ -10,6 +10,7 @@ import pytest
 from recordings import frames_of, hashes_at, manifest_of
 
 import mjrec
+from mjrec.annotation import check_annotation
 
 SIZE = {"height": 48, "width": 64}
 
@@ -70,6 +71,7 @@ def test_several_cameras(tmp_path, render):
 def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path, monkeypatch):
     """It says how to install it, and nothing is left."""
     monkeypatch.setitem(sys.modules, "PIL", None)
+    check_annotation.cache_clear()
     with pytest.raises(mjrec.MissingDependency, match=r"install 'mjrec\[annotate\]'"):
         mjrec.Monitor(gymnasium.make("Hopper-v5"), tmp_path / "run", annotate=True)
     assert not (tmp_path / "run").exists()

@@ -906,7 +906,7 @@ BELIEVED = {
     ),
     "an action edited, with a wrapper claimed": (
         *(honest.pendulum, both(edit_an_action, claim_wrapper)),
-        r"not its controls.* \[wrappers\]",
+        r"differ from the controls.* \[wrappers\]",
     ),
     "cut before the fall, with a wrapper claimed": (
         *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper), ""),

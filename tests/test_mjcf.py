@@ -173,7 +173,7 @@ def test_wrong_arguments_are_refused_at_once(write):
         MjcfEnvironment(path).render()
     with pytest.raises(mjrec.InvalidArgument, match="render_mode"):
         MjcfEnvironment(path, render_mode="human")
-    with pytest.raises(mjrec.InvalidArgument, match=r"no more arguments.*frame_skip"):
+    with pytest.raises(mjrec.InvalidArgument, match=r"no other arguments.*frame_skip"):
         make_mjcf(path, EnvironmentOptions(kwargs={"frame_skip": 2}))
 
 

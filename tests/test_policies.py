@@ -247,8 +247,8 @@ REFUSED = [
         r"ZeroDivisionError.*mjrec_test_policy.py, line 2",
     ),
     ("def f(o:\n", "f", mjrec.PolicyError, r"SyntaxError.*line 1\)\.$"),
-    ("number = 3\n", "number", mjrec.PolicyError, "3, which is neither"),
-    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which is neither"),
+    ("number = 3\n", "number", mjrec.PolicyError, "is 3, which is not callable"),
+    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "is 3, which is not callable"),
 ]
 
 
