@@ -260,7 +260,7 @@ class Run:
         return JobOutcome(key=task.key, value=None, failure=failure)
 
     def _log(self, lines: Any) -> None:
-        """Log the children's log records in this process, each text once per run."""
+        """Log the children's log records in this process, each message once per run."""
         for name, level, text in lines:
             # MuJoCo's warnings differ in times and joint numbers; log each kind only
             # once.

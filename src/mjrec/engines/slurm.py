@@ -393,7 +393,7 @@ class ArrayElement:
         end_idle_children(run)
 
     def checkpoint(self, jobs: Mapping[int, Mapping[str, Any]]) -> Any:
-        """Return the submission that continues after the time limit or a preemption."""
+        """Return the submission that resumes the jobs after a timeout or preemption."""
         _is_ending.set()
         return _submitit("local").helpers.DelayedSubmission(self, jobs)
 

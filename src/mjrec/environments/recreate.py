@@ -84,7 +84,7 @@ class Recreated:
     stand_in: StandIn | None = None
 
     def random_state(self) -> Any:
-        """Return the state of the environment's generators, in the recorded form."""
+        """Return the state of the random generators, in the form used in recordings."""
         if self.is_dm_env:
             return generator_state(self._dm_generator())
         return random_state(self.environment.unwrapped)

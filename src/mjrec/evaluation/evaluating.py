@@ -117,7 +117,7 @@ def evaluate(
             `gymnasium:mujoco`), or patterns (`dm_control/walker-*`).
         policy: a string as in `mjrec record` (`random`, `zero`, `module:name`,
             `module:name()`); or a function of the observation, an object with
-            `predict`, or a class that is built with each environment. Objects are
+            `predict`, or a class that is called with each environment. Objects are
             pickled and sent to each worker.
         directory: the evaluation's directory. It must be new or empty, unless `resume`
             or `force` is given.

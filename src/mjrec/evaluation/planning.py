@@ -276,7 +276,7 @@ def _sent_policy(
 
     Args:
         policy: a string as in `mjrec record`, a function, an object with `predict`, or
-            a class that is built with each environment.
+            a class that is called with each environment.
         kwargs: keyword arguments for the policy.
 
     Returns:
@@ -295,8 +295,8 @@ def _sent_policy(
     if not (callable(policy) or callable(getattr(policy, "predict", None))):
         raise PolicyError(
             f"The policy {policy!r:.200} is not callable and has no predict() method. "
-            "Give a function, an object with predict(), a class that is built with the "
-            "environment, or a string: random, zero, module:name or module:name()."
+            "Pass a function, an object with predict(), a class that is called with "
+            "the environment, or a string: random, zero, module:name or module:name()."
         )
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     module = inspect.getmodule(named)

@@ -231,7 +231,7 @@ def _level(level: str) -> Level:
         return Level(level)
     except ValueError as error:
         names = [known.value for known in Level]
-        raise UnknownName("level of verification", level, names) from error
+        raise UnknownName("verification level", level, names) from error
 
 
 def _sample(sample: int | None) -> int | None:

@@ -178,7 +178,7 @@ def _opened(path: Path) -> int:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a living process holds the lock file at `path`.
+    """Return whether a running process holds the lock file at `path`.
 
     A link, or anything else that is not a regular file, counts as not held.
 

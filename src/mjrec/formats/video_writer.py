@@ -42,7 +42,7 @@ _MAX_RATE_TERM = 10**6
 
 
 class VideoWriter:
-    """A writer of one video file.
+    """A writer for one video file.
 
     ::
 
@@ -55,8 +55,8 @@ class VideoWriter:
     any CPU.
 
     An existing file is replaced when the new one is complete. If no frame is written,
-    there is no file and no error. If an exception leaves the `with` block, the file is
-    finished with the frames so far, unless the encoder failed. Use a writer on one
+    there is no file and no error. If an exception escapes the `with` block, the file is
+    finished with the frames so far, unless the encoder failed. Use a writer from one
     thread at a time.
 
     Args:

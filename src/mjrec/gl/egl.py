@@ -62,7 +62,7 @@ def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
     address_of.argtypes = [ctypes.c_char_p]
 
     def call(name: str, *arguments: Any, result: Any = ctypes.c_uint) -> Any:
-        """Call an EGL function and return its result, or None if it does not exist."""
+        """Call an EGL function and return its result, or None if EGL lacks it."""
         address = address_of(name.encode())
         if not address:
             return None

@@ -139,7 +139,7 @@ class EpisodeRecording:
 
         Args:
             facts: the facts about the episode's end.
-            end_time: the time of the end, in seconds since the epoch.
+            end_time: when the episode ended, in seconds since the epoch.
         """
         stats = self._run.stats
         known = {**facts, "length": stats.steps, "reward": stats.rewards}

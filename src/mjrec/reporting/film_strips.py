@@ -122,7 +122,7 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
             f"{path.with_suffix('.png')}."
         )
     dpi = (_DOTS_PER_INCH, _DOTS_PER_INCH)
-    advice = "the same command writes it again"
+    advice = "then run the same command again"
     with writing(path, then=advice), replacing(path) as temporary:
         imwrite(temporary, strip, extension=".png", optimize=True, dpi=dpi)
 

@@ -157,7 +157,7 @@ def _decimals_of(task: ReportTask) -> int:
 
 
 def _bar(summary: TaskSummary) -> dict[str, Any] | None:
-    """Return a task's returns as percentages of their scale; None without a scale."""
+    """Return a task's returns as percentages of its scale; None if it has no scale."""
     scale = summary.score_range
     mean, minimum, maximum = summary.mean, summary.minimum, summary.maximum
     if scale is None or not scale[0] < scale[1]:

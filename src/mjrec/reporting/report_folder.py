@@ -198,7 +198,7 @@ def _replacing_folder(target: Path) -> Iterator[Path]:
         folder.rename(target)
     except OSError as error:
         raise FileNotWritten(
-            target, error.strerror, then="the same command writes it again"
+            target, error.strerror, then="then run the same command again"
         ) from error
     finally:
         if before.exists() and not target.exists():

@@ -102,7 +102,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
 
 
 def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
-    """Return the episodes of statistics files, ordered by end time.
+    """Return the episodes in statistics files, ordered by end time.
 
     Raises:
         UnreadableFile: a file is missing or damaged.

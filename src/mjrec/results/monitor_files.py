@@ -72,7 +72,7 @@ class MonitorFiles:
 
     @property
     def is_open(self) -> bool:
-        """Whether a living process holds the monitor's lock.
+        """Whether a running process holds the monitor's lock.
 
         Raises:
             OSError: the lock cannot be opened.

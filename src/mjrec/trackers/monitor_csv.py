@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stable-Baselines3's `monitor.csv` format, for its readers and plots.
+"""The `monitor.csv` format, which Stable-Baselines3's tools read and plot.
 
 ::
 

@@ -249,7 +249,7 @@ def be_nice() -> None:
 
 
 def _scene_id(trajectory: Trajectory, stage: Stage) -> str:
-    """Return an id that is equal for episodes that the same page can show."""
+    """Return an id shared by all episodes that the same page can show."""
     shapes = [(s.name, s.geom_type) for s in (*stage.shapes, *stage.soft)]
     parts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
     return hashlib.sha256(parts.encode()).hexdigest()[:16]
