@@ -180,6 +180,16 @@ def page(cheetah, pages, tmp_path_factory):
     return pages(f"{file.as_uri()}#step=7&camera=track&speed=2")
 
 
+def recorded_model(text, directory, *, steps):
+    """Record a model without actions, and return its trajectory."""
+    model, out = directory / "model.xml", directory / "run"
+    model.write_text(text)
+    arguments = ["--out", str(out), "--max-steps", str(steps), "--workers", "0"]
+    assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
+    [path] = out.glob("*.h5")
+    return mjrec.load_trajectory(path)
+
+
 def data_at(trajectory, step):
     """Return what MuJoCo computes from a recorded state."""
     data = mujoco.MjData(trajectory.model())
@@ -333,13 +343,7 @@ def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
 @pytest.mark.thorough
 def test_tendons_and_cloth_move(pages, tmp_path):
     """What changes its shape has the vertices and the segments that MuJoCo computes."""
-    model = tmp_path / "soft.xml"
-    model.write_text(_SOFT)
-    out = tmp_path / "run"
-    arguments = ["--out", str(out), "--max-steps", "8", "--workers", "0"]
-    assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
-    [path] = out.glob("*.h5")
-    trajectory = mjrec.load_trajectory(path)
+    trajectory = recorded_model(_SOFT, tmp_path, steps=8)
     file = tmp_path / "replay.html"
     assert mjrec.write_replay(trajectory, file).notes == ()
     page = pages(f"{file.as_uri()}#step=8")
@@ -434,12 +438,8 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
 
 def test_the_page_says_what_it_does_not_show(tmp_path, caplog):
     """A rope has no surface; the result, the log and the page say so."""
-    model, out = tmp_path / "rope.xml", tmp_path / "run"
-    model.write_text(_ROPE)
-    arguments = ["--out", str(out), "--max-steps", "2", "--workers", "0"]
-    assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
-    [path] = out.glob("*.h5")
-    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    trajectory = recorded_model(_ROPE, tmp_path, steps=2)
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.notes == ("One-dimensional flexible bodies are not shown.",)
     assert made.notes[0] in caplog.text
     assert f"<p>{made.notes[0]}</p>" in made.path.read_text()

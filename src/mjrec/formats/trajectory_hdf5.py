@@ -462,11 +462,9 @@ def _store(
     packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
     # Write whole chunks at a time.
     step = max(1, _BUFFER_BYTES // size // chunk) * chunk
-    if count <= step:
-        # Creating it with its values takes two thirds of the time.
-        file.create_dataset(name, data=read(0, count), dtype=kind.base, **packing)
-        return
-    dataset = file.create_dataset(name, shape, kind.base, **packing)
-    for start in range(0, count, step):
+    # Creating it with its values, if they fit, takes two thirds of the time.
+    whole = read(0, count) if count <= step else None
+    dataset = file.create_dataset(name, shape, kind.base, whole, **packing)
+    for start in range(0, count if whole is None else 0, step):
         stop = min(start + step, count)
         dataset[start:stop] = read(start, stop)

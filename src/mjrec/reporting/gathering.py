@@ -202,7 +202,7 @@ def _add_monitors(
         del by_name[_UNKNOWN_ENVIRONMENT]
     for name, recorded in by_name.items():
         rows = in_time(np.concatenate(recorded.rows))
-        # A million episodes take 60 MB.
+        # Do not hold them twice: a million episodes take 60 MB.
         recorded.rows.clear()
         find_episodes(recorded.videos, rows, recorded.runs)
         contents.tasks.append(
