@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import importlib.util
 import inspect
 import itertools
@@ -34,6 +33,7 @@ from ..json_text import loads
 from ..rates import to_rate
 from ..recorder.keep_rules import keep_rule
 from .plan import SEEDED, SUITE, Chunk, EvaluatedTask, EvaluationPlan
+from .policy_digest import pickle_digest
 from .task_sets import tasks_from
 
 DEFAULT_SEEDS = 5
@@ -303,7 +303,7 @@ def _sent_policy(
     name = str(named.__qualname__)
     name = name if module is None else f"{module.__name__}:{name}"
     payload = _pickled(policy, name)
-    content = {"its content": _digest_of_pickle(payload)}
+    content = {"its content": pickle_digest(payload, ignored=_random_class_names())}
     files = {"its code": getattr(module, "__file__", None), **files}
     return name, {**content, **_digests(files)}, payload
 
@@ -353,11 +353,8 @@ def _pickled(policy: Any, name: str) -> bytes:
     return payload
 
 
-def _digest_of_pickle(payload: bytes) -> str:
+def _random_class_names() -> set[str]:
+    """Return the names that cloudpickle gives to the classes it pickles by value."""
     from cloudpickle import cloudpickle
 
-    # A class that is pickled by value gets a different random name in each process.
-    names = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})
-    for name in names.values():
-        payload = payload.replace(name.encode(), b"0" * len(name))
-    return hashlib.sha256(payload).hexdigest()
+    return {*getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {}).values()}
