@@ -181,13 +181,16 @@ def test_another_process_goes_on_for_a_dead_one(
 ):
     """Nothing is missing, nothing is left of the first one, and it is told how it died.
 
-    It dies once in the midst of a video, and once before anything has begun.
+    It dies once in the midst of a video and is gone when it is waited for, and once
+    before anything has begun.
     """
     background = start(recorded, *in_flight(recorded))
     [process] = children() - others
     if signum == signal.SIGKILL:
         wait_until(lambda: list(recorded.glob(".*.mp4.*.part")))
     os.kill(process, signum)
+    if signum == signal.SIGKILL:
+        wait_until(functools.partial(has_ended, process))
     background.wait()
     assert background.failures == {}
     assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]

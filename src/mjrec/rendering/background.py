@@ -146,8 +146,9 @@ class Background:
         timeout, cpu_seconds = Timeout(_PATIENCES * timeout_s()), 0.0
         while self.waiting and (child := self._child) is not None:
             if not self._is_waited_for:
+                # If the process has died, this replaces it.
                 self._send(waited_for=True)
-                self._is_waited_for = True
+                continue
             on_progress(self._progress)
             has_news = timeout.wait(lambda slice_: wait_for_news([child], slice_))
             # While the process waits for something itself, it polls every second and so
@@ -220,7 +221,7 @@ class Background:
         except OSError as error:
             self._replace(f"it could not be started: {error}")
             return
-        self._is_waited_for = False
+        self._is_waited_for = "waited_for" in message
         self._child.send(**message)
         self._listen()
 
