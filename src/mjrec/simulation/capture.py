@@ -48,8 +48,8 @@ class EpisodeStart:
         scene: the scene's facts, for the trajectory; None without snapshots.
         model_fields: the fields that differ from the stored model.
         refusal: the reason why no frame can be drawn from snapshots of this model; None
-            if frames can be drawn, which has been checked.
-        words: the indices into `raw_memory.WORDS` for gathering rows of state and
+            if a check found that frames can be drawn.
+        words: the indices in `raw_memory.WORDS` for gathering rows of state and
             snapshot while `is_current` returns True; None if each capture must check
             for changes.
         is_current: a function that returns whether only the state has changed since the
@@ -192,7 +192,7 @@ class Capture:
                 this was possible when the episode began.
         """
         if self._frames is not None and self._is_current():
-            # The usual case takes half the time of the others.
+            # This usual case takes half as long as the others.
             self._frames.source.take(out)
             return None
         _, frames = self._followed()
@@ -208,7 +208,7 @@ class Capture:
         return own or None
 
     def model_changed(self) -> None:
-        """Make the next capture check everything in the model for changes."""
+        """Make the next capture check the whole model for changes."""
         self._looks_at_everything = True
         self._look_closely()
 
@@ -216,7 +216,7 @@ class Capture:
         """Make the next episode's frames independent of all previous frames.
 
         Call this between episodes. Cameras that are placed at the first frame, or that
-        each frame moves, will be as in a new simulation.
+        each frame moves, will start as in a new simulation.
         """
         self._forget()
         self._frames = None
@@ -382,7 +382,7 @@ class _Frames:
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts about the scene, including those left by the last frame."""
+        """Return the scene's facts, including the cameras after the last frame."""
         facts = {**self._facts}
         before = self._stored.scene
         if self.scene is not None and not self.view.fresh and before is not None:
@@ -427,7 +427,7 @@ class _Frames:
     def drawn(
         self, changed: dict[str, NDArray[Any]] | None
     ) -> dict[str, NDArray[Any]] | None:
-        """Move the cameras as drawing a frame would, and add that to the changes."""
+        """Move the cameras as drawing would, and add their movement to the changes."""
         if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
             self._follow_camera()
         if self.scene is None:

@@ -18,7 +18,7 @@ _HOLDERS = ("physics", "point_env", "ant_env", "robot_env")
 def simulation_in(env: object) -> Any:
     """Return the object that has MuJoCo's `model` and `data` as attributes.
 
-    These are MuJoCo's own objects, or dm_control's wrappers of them.
+    Both attributes are MuJoCo's own objects or dm_control's wrappers around them.
 
     Args:
         env: a Gymnasium or dm_env environment, wrapped or not.

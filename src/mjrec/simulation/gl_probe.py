@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program of a child process that tests one OpenGL backend.
 
-The child imports mujoco with the backend in `MUJOCO_GL`, draws a scene, checks the
-frame, and sends each result to its parent at once. So no result is lost if the driver
-crashes afterwards.
+The child imports mujoco with the backend in `MUJOCO_GL`, draws a scene, and checks the
+frame. It sends each result to its parent immediately, so no result is lost if the
+driver crashes afterwards.
 
 ::
 
@@ -11,7 +11,7 @@ crashes afterwards.
     {"error": "ImportError: ..."}                 the backend does not render, or
     {"renders": true, "gl_renderer": ..., ...}    it renders
     {"frames_per_second": 16.2}                   with --measure
-    {"devices": [...]}                            always with EGL, if it lists them
+    {"devices": [...]}                            with EGL, if it lists any
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _SMALL = 96
 _MEASURED_SECONDS = 0.8
 _MEASURED_FRAMES = 200
 
-# The colours are purely emissive, so their pixels do not depend on the light. The floor
-# and the shadows cost as much as in a normal scene.
+# The colored geoms are purely emissive, so their pixels do not depend on the light. The
+# floor and the shadows take as long to draw as in a normal scene.
 _SCENE = """
 <mujoco>
   <asset>
@@ -73,7 +73,7 @@ _TOLERANCE = 40
 
 
 class WrongFrame(Exception):
-    """A frame was drawn but does not show what it should."""
+    """A frame was drawn but does not show the expected scene."""
 
 
 def check_frame(frame: np.ndarray) -> None:
@@ -90,7 +90,7 @@ def check_frame(frame: np.ndarray) -> None:
         pixel = frame[int(row * height), int(column * width)]
         if np.abs(pixel.astype(int) - colour).max() > _TOLERANCE:
             raise WrongFrame(
-                f"The frame should show {name}, but that pixel is "
+                f"The frame should show {name}, but the pixel there is "
                 f"{tuple(pixel.tolist())}."
             )
 
@@ -143,8 +143,8 @@ def main() -> None:
             parent.send(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Any error is a result.
         parent.send(notes=list(_notes(backend)), error=_text_of(error))
-    # This comes last, because querying CUDA's numbers initializes CUDA, which may fail
-    # or hang.
+    # This comes last, because querying CUDA's device numbers initializes CUDA, which
+    # may fail or hang.
     if backend == "egl":
         used = facts.get("gl_device", {}).get("index")
         devices = [

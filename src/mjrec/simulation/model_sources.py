@@ -9,7 +9,7 @@
     fields/<name>.npy      the fields in which the stored model differs from the
                            compiled sources, because an environment set them
 
-The same content always gives the same bytes. Compiling reads no other files.
+The same content always yields the same bytes. Compiling reads no other files.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
 # A path is composed of several attributes, and each may go up this many levels. The
-# files are compiled deeper than that in an empty directory, so `..` finds nothing.
+# files are compiled at a greater depth in an empty directory, so `..` leads nowhere.
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
@@ -88,7 +88,7 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
     """Write the sources of `model`, and the fields that were set after compiling.
 
     Raises:
-        ValueError: the sources do not give the same model.
+        ValueError: the sources do not compile to the same model.
     """
     # Some names are like `./meshes/../a.obj`.
     files = {posixpath.normpath(name): data for name, data in authored.files.items()}
@@ -174,10 +174,10 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
         references = _References(name, authored.files[name])
         goes_up |= references.go_up
         for reference in references.xml:
-            # Removed, so that no file is checked twice, however often it is named.
+            # Removed, so that no file is checked twice, even with several references.
             waiting += by_base_name.pop(PurePosixPath(reference).name, [])
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        # Only if needed: so many folders take longer than compiling most models.
+        # Only if needed: creating the folders takes longer than most compilations.
         root = Path(directory) / _EMPTY if goes_up else Path(directory)
         for name, content in authored.files.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -187,7 +187,7 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """The files that one MJCF file refers to, by the names in that file.
+    """The files that one MJCF file refers to, under the names used in it.
 
     Attributes:
         xml: other MJCF files.

@@ -10,14 +10,14 @@ too. So the models that this user stores are listed where only this user can wri
     ~/.local/state/mjrec/models        by default
     <temporary directory>/mjrec-<uid>/models       if that is not writable
 
-A list that others can open is neither used nor replaced, because only its owner knows
-what they wrote. Until its permissions are fixed, new models are listed in the other
-place.
+A list that others can open is neither used nor replaced, because only its owner can
+judge its content. Until its permissions are fixed, new models are listed in the other
+location.
 
 A list that reaches 65,536 lines becomes `models.old` and replaces the previous
 `models.old`, whose models are then no longer trusted.
 
-Workers on other machines may have different home directories. They are sent the hashes
+Workers on other machines may have different home directories. They receive the hashes
 that their jobs need, and list them as their own. They report the models that they
 store, and the machine that sent the job lists these models.
 
@@ -113,10 +113,10 @@ def is_stored(digest: object) -> bool:
 
 
 def directory_digest(directory: Path) -> str:
-    """Return the digest with which `note_models` lists a directory.
+    """Return the digest that represents a directory in the list of models.
 
     The digest identifies the directory by its path. A directory that was moved or
-    copied is untrusted, which costs only a moment.
+    copied is untrusted, which only delays reading from it.
     """
     place = f"directory {os.path.realpath(directory)}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
@@ -168,7 +168,7 @@ def _warn_once(message: str) -> None:
 
 
 def _directories() -> Iterator[Path]:
-    """Yield the possible directories for a list, starting with the best."""
+    """Yield the possible directories for a list, best first."""
     state, home = os.environ.get("XDG_STATE_HOME", ""), os.path.expanduser("~")  # noqa: PTH111  `Path.home` raises for users without one
     # The XDG specification says to ignore relative paths.
     if state.startswith("/"):

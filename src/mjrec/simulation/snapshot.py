@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Snapshots of a simulation, taken as rows of bytes and restored for drawing.
 
-A snapshot that is restored into a new `MjData` gives the same scene, byte for byte.
+A snapshot that is restored into a new `MjData` yields the same scene, byte for byte.
 This is checked during recording, because MuJoCo may read a field that we do not know
 about. Building a scene takes microseconds and needs no OpenGL. So one scene is built
 from the live data and another from the restored snapshot, and they must be equal.
@@ -31,7 +31,7 @@ from .view import SceneView
 # Arrays of indices into the geoms and into each other, which the visualizer does not
 # check.
 _PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
-# This value replaces the index of a geom.
+# This value takes the place of a geom's index.
 _PULLEY = -2
 
 _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
@@ -153,7 +153,7 @@ def check_layout(
         own = array_kind(model if is_colour else data, name)
         if kind[name] != own:
             raise InvalidArgument(
-                f"The snapshots' {name} is {kind[name]}, but here it is {own}. They "
+                f"The snapshots' {name} is {kind[name]}, but it must be {own}. They "
                 "belong to another model or version of MuJoCo."
             )
     held = {*(kind.names or ())}
@@ -163,7 +163,7 @@ def check_layout(
 
 
 def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Restore a snapshot so that `mjv_updateScene` can use the data.
+    """Restore a snapshot into `data` for use with `mjv_updateScene`.
 
     Args:
         row: an element of `TrajectoryReader.snapshots`, whose layout was checked.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes that are read back as arrays.
+"""Recorded episodes, read back as arrays.
 
 Reading needs no simulator. MuJoCo is imported only for a model or its data.
 """
@@ -81,7 +81,7 @@ class Trajectory:
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
     is the input of the environment, which need not be the input of the actuators.
 
-    Snapshots and changes to the model are read on demand, and the rest is in memory.
+    Snapshots and changes to the model are read on demand; all other data is in memory.
 
     Args:
         reader: the file's reader; it may be closed afterwards.
@@ -236,7 +236,7 @@ class Trajectory:
                 self.path, "no MuJoCo simulation was found when it was recorded"
             )
         if not isinstance(stored, Mapping):
-            raise UnreadableFile(self.path, "its facts about its model are invalid")
+            raise UnreadableFile(self.path, "its metadata about the model is invalid")
         model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
             # Apply one change at a time, because there may be thousands of changes,
@@ -250,7 +250,7 @@ class Trajectory:
         return model
 
     def set_state(self, data: mujoco.MjData, step: int) -> None:
-        """Set a recorded state in `data`, without computing derived quantities.
+        """Write a recorded state into `data`, without computing derived quantities.
 
         Args:
             data: a `mujoco.MjData` of `model()`.
@@ -289,4 +289,4 @@ def _what_is_in(path: Path) -> str:
     if not names:
         return f"{path} is a {kind} without trajectories."
     shown = listed(names, _SHOWN)
-    return f"{path} is a {kind}. Name one of the trajectories in it: {shown}."
+    return f"{path} is a {kind}. Choose one of its trajectories: {shown}."
