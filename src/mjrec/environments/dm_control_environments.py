@@ -57,11 +57,11 @@ def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
             hint="A dm_control environment's name is dm_control/<domain>-<task>.",
         )
     if task not in tasks:
-        raise UnknownName(f"task of dm_control's {domain}", task, tasks)
+        raise UnknownName(f"dm_control {domain} task", task, tasks)
     for name in options.kwargs:
         if name not in _ARGUMENTS:
             raise UnknownName(
-                "argument for a dm_control environment",
+                "dm_control environment argument",
                 name,
                 _ARGUMENTS,
                 hint='For example {"task_kwargs": {"time_limit": 5}}.',

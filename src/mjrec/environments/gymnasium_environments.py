@@ -223,7 +223,7 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
             raise _not_drawn(spec.id, f"render_mode={mode!r} was requested")
         # Gymnasium itself collects frames from `rgb_array` for `rgb_array_list`.
         if modes is not None and str(mode).removesuffix("_list") not in modes:
-            raise UnknownName(f"render mode of {spec.id}", mode, modes)
+            raise UnknownName(f"{spec.id} render mode", mode, modes)
     else:
         # If the modes are unknown, request frames.
         there = _PREFERRED_MODES if modes is None else modes

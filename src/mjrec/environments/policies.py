@@ -270,7 +270,7 @@ def _import(module_name: str, text: str) -> ModuleType:
             if not f"{module_name}.".startswith(f"{error.name}."):
                 raise
             raise UnknownName(
-                "module for a policy",
+                "policy module",
                 module_name,
                 sorted(
                     p.stem for p in Path.cwd().glob("*.py") if p.stem.isidentifier()

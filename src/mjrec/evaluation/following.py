@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distribution of an evaluation to workers, from its start to the drawn videos.
+"""Distribution of an evaluation to workers, from the start to the finished videos.
 
 The results of episodes are read from the chunks' journals, never from the return values
 of workers.
@@ -35,8 +35,8 @@ from .result_tables import EpisodeFiles
 
 logger = logging.getLogger(__name__)
 
-# The number of seconds between progress reports, and the maximum share of the time that
-# is spent on counting finished episodes.
+# The number of seconds between progress reports, and the maximum share of time spent on
+# counting finished episodes.
 _SECONDS_BETWEEN_REPORTS = 0.25
 _MOST_OF_TIME = 0.05
 
@@ -80,7 +80,7 @@ class ChunkRun:
         folder: the chunk's monitor directory.
         known: the chunk's finished episodes, as last read.
         size: value of `ChunkResults.size` when the chunk was last submitted.
-        reason: the reason to give for episodes that have no result.
+        reason: the reason reported for episodes that have no result.
     """
 
     task: EvaluatedTask
@@ -102,13 +102,13 @@ class ChunkRun:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the chunk is complete, and its recordings are finished too."""
+        """Whether the chunk is complete and its recordings are finished."""
         return self.is_complete and not any(
             has_leftovers(files) for files in monitors_of(self.folder)
         )
 
     def result(self, unit: Unit) -> EpisodeResult:
-        """Return the result of an episode, which has failed if no result is known."""
+        """Return the result of an episode, or a failure if no result is known."""
         return self.known.results.get(unit) or EpisodeResult(
             task=self.task.name,
             seed=unit[0],
@@ -123,7 +123,7 @@ class ChunkRun:
 
 @dataclass(frozen=True)
 class Choice:
-    """The episodes that get a video.
+    """The episodes chosen for videos.
 
     Attributes:
         selection: the chosen episodes of each task.
@@ -147,8 +147,8 @@ def check_tasks(
     Args:
         run: the workers.
         plan: the plan of the evaluation.
-        workers: number of workers to start if there are new tasks. Each worker has to
-            create an environment sooner or later, so they all do it now, in parallel.
+        workers: number of workers to start if there are new tasks. Each worker must
+            create an environment eventually, so all workers do so now, in parallel.
 
     Returns:
         The plan with the tasks' step limits, and for each new task a rough measure of
@@ -194,8 +194,8 @@ def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
 def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationProgress:
     """Run the missing episodes of all chunks, and return the final progress.
 
-    A killed process may have left all results of a chunk, but its recordings
-    unfinished. Such a chunk is also submitted, because its job finishes them.
+    A killed process may have left a chunk with all results but unfinished recordings.
+    Such a chunk is also submitted, because its job finishes the recordings.
 
     Args:
         run: the workers.
@@ -215,14 +215,14 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
             # Models that this process's own workers stored can be trusted.
             note_models((outcome.value or {}).get("models", ()))
             if not each.is_complete and each.known.size > each.size:
-                # There was progress, so the chunk is submitted again. An episode that
+                # There was progress, so the chunk is resubmitted. An episode that
                 # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
             if outcome.failure or not each.is_complete:
                 said = outcome.failure or (
-                    f"A worker finished {each.folder}, but the recordings are missing "
-                    "there. All machines must see the directory under the same path."
+                    f"A worker finished {each.folder}, but its recordings are missing "
+                    "here. All machines must see the directory under the same path."
                 )
                 logger.warning("%s", said)
                 each.reason = said.partition(" Its last output")[0]
@@ -262,13 +262,13 @@ def choose_videos(
     chunks: Sequence[ChunkRun],
     results: Mapping[str, Sequence[EpisodeResult]],
 ) -> Choice:
-    """Choose the episodes that get a video, and write the choice to the folders."""
+    """Choose the episodes for videos, and write the choice to the folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
     chunk_of = _by_monitor(chunks)
     for task, of_task in results.items():
-        # The order in which ties are broken must depend only on the episodes.
+        # The tie-breaking order must depend only on the episodes.
         own = sorted(of_task, key=lambda each: each.unit)
         kept = keep_rule(plan.keep).choose([each if each.key else None for each in own])
         roles: dict[Path, dict[RecordingKey, list[str]]] = {}
@@ -410,7 +410,7 @@ def _by_monitor(
 
 
 def _submit(run: Run, each: ChunkRun) -> str:
-    # A chunk is only submitted again when its size has grown, so the key is unique.
+    # A chunk is resubmitted only if its size has grown, so the key is unique.
     each.size = each.known.size
     key, chunk = f"{each.place}/{each.size}", dataclasses.asdict(each.chunk)
     run.submit(key, kind="run", task=each.task.name, folder=each.place, chunk=chunk)

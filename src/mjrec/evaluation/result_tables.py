@@ -72,7 +72,7 @@ class EpisodeFiles:
         folder: path of the monitor directory, relative to the evaluation's directory;
             None if the episode has no files.
         trajectory: base name of the trajectory; None if the episode has no trajectory.
-        video: base name of the finished or pending video; None if the episode gets no
+        video: base name of the finished or pending video; None if the episode has no
             video.
     """
 
@@ -186,7 +186,7 @@ def write_timing_table(
     Args:
         file: the file, opened with `newline=""`.
         results: all episodes, in the plan's order.
-        files: a function that returns the files of an episode.
+        files: a function that returns an episode's files.
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_TIMING)
@@ -325,7 +325,7 @@ def _truth_text(value: bool | None) -> str:
 
 
 def _one_line(text: str) -> str:
-    # A failed episode must have text here, even if the error has no message.
+    # A failed episode must have a reason, even if the error has no message.
     shown = "".join(c if c.isprintable() else " " for c in _encodable(text))
     return " ".join(shown.split())[:_LONGEST_FAILURE] or "unknown"
 

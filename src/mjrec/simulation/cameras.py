@@ -84,7 +84,7 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
         for name, value in camera.items():
             if name.startswith("_") or not hasattr(resolved, name):
                 known = [known for known in dir(resolved) if not known.startswith("_")]
-                raise UnknownName("member of mujoco.MjvCamera", name, known)
+                raise UnknownName("mujoco.MjvCamera member", name, known)
             setattr(resolved, name, value)
         check_camera(model, resolved)
         return resolved
