@@ -2,6 +2,6 @@
 """Engines that run jobs: local processes, a Ray cluster, Slurm, or any executor.
 
 `jobs` submits jobs to an executor and follows them. `worker` does a job in a child
-process, which runs `child`. `local`, `ray` and `slurm` are executors, and `choice`
+process that runs `child`. `local`, `ray` and `slurm` are executors, and `choice`
 creates an executor from a name.
 """
