@@ -222,7 +222,7 @@ class Run:
         try:
             answer = future.result()
         except CancelledError:
-            answer = {"died": "was cancelled by its executor", "begun": True}
+            answer = {"died": "was canceled by its executor", "begun": True}
         except Error:
             raise
         except Exception as error:

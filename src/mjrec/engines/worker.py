@@ -152,7 +152,7 @@ class _JobChild(Child):
                 if limit and time.monotonic() > ends_at:
                     self.kill()
                 if not self._work.exists():
-                    how = "was cancelled"
+                    how = "was canceled"
                     break
             elif "log" in message:
                 log.append(message["log"])

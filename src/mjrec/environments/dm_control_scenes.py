@@ -309,7 +309,7 @@ class _PhysicsScene:
         capture()
 
     def is_unmoved(self) -> bool:
-        """Check quickly whether the view is certainly the same as for the last frame.
+        """Check quickly whether the view is known to be unchanged since the last frame.
 
         Changes to the model, the camera and the option are not checked for. The result
         is True if the simulation is the same as when the view was last requested.

@@ -29,7 +29,7 @@ from ..errors import MissingDependency, PolicyError, UnknownName
 
 
 def file_of_policy(text: str) -> Path | None:
-    """Return the file that a policy's name refers to, or None if it is not a file.
+    """Return the file that a policy name refers to, or None if it is not a file name.
 
     Raises:
         UnknownName: the name is a file name, but the file does not exist.
@@ -64,7 +64,7 @@ def policy_in_file(path: Path, environment: Any, **kwargs: Any) -> Any:
 
 
 class _Model:
-    """A Stable-Baselines3 policy, the component of an algorithm that acts."""
+    """The policy of a Stable-Baselines3 algorithm, without the code for learning."""
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy

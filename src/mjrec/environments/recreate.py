@@ -114,7 +114,7 @@ class Recreated:
         self._dm_generator().seed(seed)
 
     def seed_behind(self, state: Any) -> int | None:
-        """Return the seed behind an unused generator's state, or None.
+        """Return the seed that produced an unused generator's state, or None.
 
         This works only for dm_control, because the state of NumPy's legacy generator
         starts with its seed.

@@ -157,7 +157,7 @@ def render_override(
     """Return the reason why frames may differ if `render` is overridden, or None.
 
     Args:
-        what: a noun for `drawn`, for the reason.
+        what: a noun that describes `drawn`, for the returned reason.
         drawn: the object whose `render` is called.
         known: the modules and qualified names of the functions that do not count as
             overriding `render`.

@@ -97,7 +97,7 @@ class ChunkRun:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all episodes of the chunk have a result."""
+        """Whether all episodes in the chunk have results."""
         return all(unit in self.known.results for unit in self.chunk)
 
     @property

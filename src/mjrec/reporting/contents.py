@@ -124,7 +124,7 @@ class Verdict:
         verdict: `PASS`, `PARTLY` or `FAIL`.
         counts: number of findings by outcome: recreated, within tolerance, believed,
             different.
-        level: the level of the verification.
+        level: the verification level.
     """
 
     source: str

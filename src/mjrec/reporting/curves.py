@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SVG figures for a report's page, in the page's colours.
+"""SVG figures for a report's page, in the page's colors.
 
 Each function returns one `<svg>` element for an HTML page. The element uses classes
 instead of colors (`f-` for fills, `s-` for strokes, such as `s-accent`), so that one
@@ -173,7 +173,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
 def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
-    """Return the centres of running windows, and their 10%, mean and 90% values."""
+    """Return the centers of running windows, and their 10%, mean and 90% values."""
     count = max(0, len(returns) - window + 1)
     if not count:
         return (np.empty(0),) * 4

@@ -108,7 +108,7 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
 
 
 def pairs_of_results(results: Evaluation, task: str) -> Iterator[tuple[str, str]]:
-    """Yield the provenance of the episodes for one task in an evaluation."""
+    """Yield the provenance of one task's episodes in an evaluation."""
     plan = results.plan
     yield "Environment", task
     yield "Environment arguments", ", ".join(kwargs_as_text(plan.env_kwargs))

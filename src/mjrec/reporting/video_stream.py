@@ -114,7 +114,7 @@ def frames_at(
 
     Raises:
         EncoderError: the video cannot be decoded up to these frames.
-        UnreadableFile: the video has fewer frames than it claims.
+        UnreadableFile: the video has fewer frames than its packets indicate.
     """
     width, scale = stream.width, ""
     if most_width is not None and most_width < width:

@@ -130,7 +130,7 @@ def is_tracking(camera: object) -> bool:
 def tracking_camera(model: Any) -> str | int | None:
     """Return the camera in the model that follows the robot, if there is one.
 
-    This is the first camera that follows the centre of mass of a body's subtree
+    This is the first camera that follows the center of mass of a body's subtree
     (`mode="trackcom"`). If there is no such camera, it is the first one that follows a
     body (`mode="track"`) of a robot that can travel, because a free or sliding joint
     connects it to the world. An arm with a fixed base cannot travel, and a camera that

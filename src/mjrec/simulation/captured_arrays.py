@@ -90,7 +90,7 @@ def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
 
 
 def has_limited_tendons(model: mujoco.MjModel) -> bool:
-    """Return whether a tendon may be drawn in a colour different from the model's."""
+    """Return whether a tendon may be drawn in a color different from the model's."""
     if not model.ntendon:
         return False
     spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP

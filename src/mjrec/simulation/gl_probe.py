@@ -63,7 +63,7 @@ _SCENE = """
 </mujoco>
 """
 
-# A pixel's (row, column) as fractions of height and width, and its expected colour.
+# A pixel's (row, column) as fractions of height and width, and its expected color.
 _EXPECTED = {
     "red on the left": ((0.62, 0.23), (255, 0, 0)),
     "blue on the right": ((0.62, 0.77), (0, 0, 255)),
@@ -80,7 +80,7 @@ def check_frame(frame: np.ndarray) -> None:
     """Check that `frame` shows the probe's scene.
 
     Raises:
-        WrongFrame: the frame has a single colour, or a colour is in the wrong place.
+        WrongFrame: the frame has a single color, or a color is in the wrong place.
     """
     if np.ptp(frame.reshape(-1, 3), axis=0).max() == 0:
         colour = tuple(frame[0, 0].tolist())

@@ -107,7 +107,7 @@ class Looks:
         """Return the watched fields that have changed since the last look.
 
         Args:
-            anything: whether to compare textures, meshes and so on too.
+            anything: whether to also compare textures, meshes and so on.
 
         Returns:
             Copies by name, or None if nothing has changed. In that case, the call takes

@@ -85,7 +85,7 @@ class RecordedScene:
             Whether a model field that an OpenGL context keeps has changed.
 
         Raises:
-            UnreadableFile: the file is damaged, or does not fit its model.
+            UnreadableFile: the file is damaged, or does not match its model.
         """
         try:
             changed = self._change_model(int(self._reader.frame_steps[index]))

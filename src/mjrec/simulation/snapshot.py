@@ -93,12 +93,12 @@ class SnapshotSource:
 
 
 class TendonColours:
-    """The colours in which a model's tendons are drawn.
+    """The colors in which a model's tendons are drawn.
 
-    If a spatial tendon is at its limit, MuJoCo blends its colour with the colour of
+    If a spatial tendon is at its limit, MuJoCo blends its color with the color of
     constraints, weighted by the strength of the limit. Tendons with a material or a
-    colour of their own are not blended. The strength is not kept after the step, so the
-    resulting colour is recorded. It is read from a scene that contains only the
+    color of their own are not blended. The strength is not kept after the step, so the
+    resulting color is recorded. It is read from a scene that contains only the
     tendons.
 
     Attributes:
@@ -167,7 +167,7 @@ def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> No
 
     Args:
         row: an element of `TrajectoryReader.snapshots`, whose layout was checked.
-        model: the model. Its tendons' colours are set if `row` has them.
+        model: the model. Its tendons' colors are set if `row` has them.
         data: the model's data.
 
     Raises:
@@ -218,7 +218,7 @@ def scene_difference(
     """
     if model.nplugin:
         return "its plugins may draw from their own memory"
-    # The tendons' own colours are restored into the model.
+    # The tendons' own colors are restored into the model.
     sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
     restored = mujoco.MjData(restored_model)
