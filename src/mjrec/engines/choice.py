@@ -63,7 +63,7 @@ def engine_from(
         name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"` with the address of a
             Dask scheduler.
         workers: maximum number of workers; None uses the engine's default.
-        address: address of a Ray cluster, or `"auto"` for the cluster that runs on this
+        address: address of a Ray cluster, or `"auto"` for the cluster running on this
             machine. If None, the cluster named by `RAY_ADDRESS` is used. If that
             variable is also unset, Ray is started for the run.
         gpus: number of GPUs for each worker, which may be a fraction.

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs that are submitted to an executor and followed until they are done.
+"""Jobs that are submitted to an executor and monitored until they are done.
 
 An engine is a `concurrent.futures.Executor`: one of ours (`LocalEngine`, `RayEngine`,
-`SlurmEngine`) or any other whose workers see the same directory. The executor calls
-`worker.do_job` with plain data. That function does the job in a child process of the
-worker, so a crash affects only one job, not the executor.
+`SlurmEngine`) or any other executor whose workers see the same directory. The executor
+calls `worker.do_job` with plain data. That function does the job in a child process of
+the worker, so a crash affects only one job, not the executor.
 
-Doing a job twice is harmless, so if the child dies, the job is submitted again.
+Doing a job twice is harmless, so if the child dies, the job is resubmitted.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _TEMPORARY = Path(os.environ.get("TMPDIR") or "/tmp")
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """The work of a run's children.
+    """The work for a run's children.
 
     Attributes:
         entry: `module:name` of a function that creates a handler. It is called once in
@@ -57,7 +57,7 @@ class Work:
             `leave` method, it is called on another thread when the child has to exit
             for reasons other than its own failure.
         settings: settings for all jobs, as JSON.
-        environ: environment variables for the children, in addition to their worker's.
+        environ: environment variables for the children, in addition to the worker's.
         shared_directory: a directory that all workers see under this path; a folder in
             it is used during the run. None is allowed if all processes are on this
             machine.
@@ -95,7 +95,7 @@ class _Task:
 
 
 class Run:
-    """The jobs of a `Work` on an executor.
+    """A run of a `Work` on an executor.
 
     Leaving the `with` block cancels unfinished jobs.
 
@@ -287,7 +287,7 @@ def _new_place(shared: Path | None) -> Path:
 
 
 def _end_earlier_runs(folder: Path) -> None:
-    """Remove the folders of killed drivers, which ends the children of their runs."""
+    """Remove the folders left by killed drivers, which ends those runs' children."""
     for path in folder.glob(f"*/{WORK}"):
         with contextlib.suppress(OSError), path.open("rb") as file:
             # This raises an error if the driver is running.

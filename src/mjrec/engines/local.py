@@ -19,13 +19,13 @@ from .gpu_shares import GpuShare, check_worker_count
 
 
 class LocalEngine(Executor):
-    """An engine that runs jobs on this machine, with a thread and a child per worker.
+    """An engine that runs jobs on this machine, with one thread and child per worker.
 
     Args:
         workers: maximum number of workers. None means one per usable CPU.
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
             workers share a GPU. Workers share the GPUs in `CUDA_VISIBLE_DEVICES`, or
-            all of the machine's GPUs if it is not set.
+            all of the machine's GPUs if that variable is not set.
         require_gpu: whether a worker that was given a GPU but renders in software is an
             error instead of a warning.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each of which does some of a run's jobs.
+"""An engine for Slurm: arrays of Slurm jobs, each of which does some jobs of a run.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
 on the survival of a single Slurm job. A Slurm job that is requeued does only its
@@ -68,7 +68,7 @@ _NOT_OVER = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A job of a run, with its future."""
+    """A job in a run, with its future."""
 
     number: int
     place: Path
@@ -77,7 +77,7 @@ class _Task:
 
 
 class SlurmEngine(Executor):
-    """An engine that runs jobs in Slurm jobs.
+    """An engine that runs jobs inside Slurm jobs.
 
     Args:
         workers: maximum total number of workers in all Slurm jobs. None means 4, or one
@@ -97,7 +97,7 @@ class SlurmEngine(Executor):
         qos: quality of service.
         constraint: features that nodes must have.
         time_min: time limit for a Slurm job, in minutes. A Slurm job that reaches the
-            limit is requeued and continues. It must exceed the longest single job.
+            limit is requeued and continues. The limit must exceed the longest job.
         notice_s: how many seconds before the time limit a Slurm job stops. None means
             120, or a quarter of the limit if that is shorter.
         mem_gb: memory per worker, in gigabytes.
@@ -367,10 +367,10 @@ class ArrayElement:
     share: GpuShare
 
     def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
-        """Do the jobs that have no outcome yet.
+        """Do the jobs that do not have an outcome yet.
 
         Args:
-            jobs: the jobs, by number.
+            jobs: the jobs, keyed by number.
         """
         # submitit does not handle SIGTERM. Children exit with this process.
         signal.signal(signal.SIGTERM, lambda *_: os._exit(1))

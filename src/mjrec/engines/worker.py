@@ -38,7 +38,7 @@ parent: Parent | None = None
 
 
 def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
-    """Do a job in a child process, and return its outcome as plain data.
+    """Do a job in a child process, and return the outcome as plain data.
 
     Args:
         place: the run's folder.
@@ -111,7 +111,7 @@ class _JobChild(Child):
             `CUDA_VISIBLE_DEVICES`; None means this process's own setting.
 
     Raises:
-        OSError: the process cannot be started, or the run does not exist.
+        OSError: the process cannot be started, or the run no longer exists.
     """
 
     def __init__(self, place: str, gpus: str | None) -> None:

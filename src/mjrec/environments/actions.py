@@ -22,7 +22,7 @@ _ENDLESS = 1e10
 
 
 def action_space(environment: Any) -> Space[Any]:
-    """Return the space of an environment's actions, for sampling.
+    """Return an environment's action space, for sampling.
 
     The space is a copy, so sampling does not affect the environment's own space.
 

@@ -28,7 +28,7 @@ _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
-    """Create a task of the suite.
+    """Create a task from the suite.
 
     The camera and the size apply to each frame, not to the environment. Episodes end
     after `max_steps`, or after 1000 steps if the task has no time limit.

@@ -38,7 +38,7 @@ _UPLOADS = ("mjr_uploadHField", "mjr_uploadTexture", "mjr_uploadMesh")
 
 
 class ContextsOnDemand:
-    """A guard that keeps resets from creating contexts only to upload terrain to them.
+    """A guard that prevents resets from creating contexts only for terrain uploads.
 
     Some tasks (quadruped-escape, the rodent's bowl) create a new terrain in each reset
     and upload it to the rendering context. Even checking for a context creates one. If
@@ -59,9 +59,9 @@ class ContextsOnDemand:
     def resetting(self) -> Iterator[None]:
         """Return a context manager for resetting the environment.
 
-        Inside the block, a physics that has no contexts gets a stand-in for them, which
-        creates real contexts as soon as anything is drawn. After the block, the physics
-        is restored, even if an error was raised.
+        Inside the block, a physics without contexts gets a stand-in, which creates real
+        contexts as soon as anything is drawn. After the block, the physics is restored,
+        even if an error was raised.
         """
         self._is_resetting = True
         # If the reset compiles a new physics, this hook receives it in time.
@@ -251,7 +251,7 @@ class PhysicsFrames:
 def _own_context(physics: Any) -> Iterator[Any]:
     """Make the context that dm_control draws with current, and yield its executor.
 
-    dm_control remembers which context it made current last. If another library has
+    dm_control remembers which context it last made current. If another library has
     since changed the current context, dm_control would draw without one. Its context
     must not stay current either: when a `mujoco.Renderer` is closed or collected, it
     frees those objects in the current context that have the same numbers as its own. In
@@ -340,7 +340,7 @@ def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> boo
 
 
 def _authored(env: Any) -> AuthoredModel | None:
-    """Return the MJCF that composer or the suite compiled, or None."""
+    """Return the MJCF compiled by composer or the suite, or None if unknown."""
     task = getattr(env, "task", None)
     root = getattr(task, "root_entity", None)
     if root is None:
@@ -351,7 +351,7 @@ def _authored(env: Any) -> AuthoredModel | None:
 
 
 def _authored_of_suite(task: Any) -> AuthoredModel | None:
-    """Return the sources of a domain's models, from the task's module, or None.
+    """Return a domain's model sources from the task's module, or None.
 
     A task does not keep its model's sources, and may have changed them before
     compiling. Storing the sources checks that they compile to this model.

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Derivation of an episode's seeds from the run's seed.
 
-To reproduce them by hand::
+To reproduce the seeds by hand::
 
     words = numpy.random.SeedSequence([seed, episode]).generate_state(3)
     environment, actions, policy = (int(word) >> 1 for word in words)
 
 Each word has 32 bits. Its lowest bit is dropped, because some generators accept only 31
 bits. An episode's seeds depend only on `seed` and `episode`, so any episode can be
-reproduced without the episodes before it.
+reproduced without running earlier episodes.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def environment_from_name(
 ) -> NamedEnvironment:
     """Create the environment with the given name.
 
-    If it cannot be drawn, the environment has no frames, and `not_drawn` says why.
+    If drawing is impossible, it has no frames, and `not_drawn` gives the reason.
 
     Args:
         text: see `parse_environment_name`.

@@ -51,7 +51,7 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
     environment has only text. A MuJoCo environment shows its model's tracking camera if
     there is one and no other view was requested. The default camera of Gymnasium 1.4
     does not move, so the robot leaves its frame. The environment's own time limit is
-    lowered to `max_steps`. If it has none, its limit is `max_steps`, or 1000 steps by
+    lowered to `max_steps`. Without one, the limit is `max_steps`, or 1000 steps by
     default.
 
     Args:
@@ -245,7 +245,7 @@ def _not_drawn(env_id: str, why: str) -> NoPictures:
 
 
 def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
-    """Raise an error early if pygame is missing, instead of at the first frame."""
+    """Raise an error now if pygame is missing, instead of at the first frame."""
     if importlib.util.find_spec("pygame") is None:
         text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
         raise MissingDependency(

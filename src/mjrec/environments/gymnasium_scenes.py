@@ -87,7 +87,7 @@ def gymnasium_scenes(
 
     Without a camera, height or width, the frames are those of `env.render()`, and
     anything that overrides `render` is an obstacle. If any of these is given, the
-    frames show only the scene, without anything that a wrapper draws on top, and there
+    frames show only the scene, without anything drawn on top by a wrapper, and there
     are no live frames.
 
     Args:
@@ -186,7 +186,7 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
 
 
 def _obstacle(base: Any, shown: Any) -> str | None:
-    """Return the reason why an environment shows more than its simulation, or None.
+    """Return why an environment's frames show more than the simulation, or None.
 
     Args:
         base: the environment without its wrappers.

@@ -77,7 +77,7 @@ def mujoco_ids() -> tuple[str, ...]:
 def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
     """Return the newest version of each id, keyed by the id without its version.
 
-    An id without a version is kept only if it has no versioned sibling.
+    An id without a version is kept only if no versioned form exists.
     """
     newest: dict[str, str] = {}
     for env_id in sorted(env_ids, key=version_of):
@@ -92,7 +92,7 @@ def version_of(env_id: str) -> int:
 
 
 def dm_control_failure(name: str, error: Exception) -> Error:
-    """Return the error for an exception from importing dm_control or loading a task.
+    """Return the error to raise when importing dm_control or loading a task has failed.
 
     Args:
         name: the environment's name.
@@ -158,7 +158,7 @@ def _names(framework: str, what: str) -> list[str]:
 
 
 def _ids_registered_by(module: str) -> set[str]:
-    """Import a module, and return the ids that this module itself registers."""
+    """Import a module, and return the ids that it registers itself."""
     import gymnasium
     from gymnasium.envs import registration
 

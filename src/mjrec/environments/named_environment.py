@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An environment that was requested by name: its options, and how to run it."""
+"""An environment requested by name: its options, and how to run it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class EnvironmentOptions:
 
     @property
     def size(self) -> dict[str, int]:
-        """The requested `height` and `width`, without values that are None."""
+        """The requested `height` and `width`, excluding None."""
         sides = {"height": self.height, "width": self.width}
         return {name: side for name, side in sides.items() if side is not None}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The names of environments, and imports of modules that users name."""
+"""The names of environments, and imports of user-specified modules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MJCF_SUFFIXES = (".xml", ".mjcf")
 
 @dataclass(frozen=True)
 class EnvironmentName:
-    """A parsed name of an environment.
+    """A parsed environment name.
 
     Attributes:
         framework: `"gymnasium"`, `"dm_control"` or `"mjcf"`.

@@ -116,9 +116,8 @@ class _ForeignPolicy(Policy):
 class _Predictor:
     """A function that calls a Stable-Baselines3 policy's `predict` for one environment.
 
-    Recurrent policies receive the last state that they returned, and whether the
-    observation is the first in its episode. Arguments that `predict` does not accept
-    are left out.
+    Recurrent policies receive their last returned state and whether the observation is
+    the first in its episode. Arguments that `predict` does not accept are left out.
     """
 
     def __init__(self, predictor: Any) -> None:
@@ -218,7 +217,7 @@ def policy_from(
 
 
 def policy_file(text: str) -> Path | None:
-    """Return the file that a loaded policy comes from.
+    """Return the file from which a policy was loaded.
 
     Args:
         text: the name that was passed to `load_policy`.
@@ -280,7 +279,7 @@ def _import(module_name: str, text: str) -> ModuleType:
 
 
 def _offered(module: ModuleType) -> list[str]:
-    """Return the names of a module's objects that could be policies."""
+    """Return the names of objects in a module that could be policies."""
     return sorted(
         name
         for name, value in vars(module).items()
@@ -293,7 +292,7 @@ def _offered(module: ModuleType) -> list[str]:
 
 @contextlib.contextmanager
 def _failures_named(*what: str) -> Iterator[None]:
-    """Turn exceptions in third-party code into a PolicyError with their location."""
+    """Convert exceptions in third-party code to a PolicyError with the location."""
     try:
         yield
     except Error:

@@ -11,8 +11,8 @@
 `.onnx`            the same, run by onnxruntime on the CPU
 =================  ==================================================================
 
-An observation with several parts is concatenated if the file takes a single array.
-Reading a model.zip or TorchScript file runs its code, so read only trusted files.
+An observation with several parts is concatenated if the file expects one array. Reading
+a model.zip or TorchScript file runs its code, so read only trusted files.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _network(
 
 
 def _row(observation: Any) -> NDArray[np.float32]:
-    """Return the numbers of an observation, concatenated."""
+    """Return all numbers in an observation as one row."""
     parts = observation.values() if isinstance(observation, Mapping) else [observation]
     return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
 

@@ -2,7 +2,7 @@
 """Functions that recreate the environment of a recording if this is safe.
 
 A recording may be untrusted, and creating an environment runs the environment's code.
-So nothing that a recording names is imported. An environment is created only if its id
+So no module named in a recording is imported. An environment is created only if its id
 is already in the installed registry and belongs to Gymnasium itself, Gymnasium-Robotics
 or dm_control's suite. Its arguments must be plain values within bounds and name no
 files. Wrappers must be Gymnasium's own, and their arguments must meet the same
@@ -213,7 +213,7 @@ def recreate(
 
 
 def checked_options(options: Any) -> dict[str, Any] | None:
-    """Return the options of a reset, if they are plain values.
+    """Return the options of a reset if they are plain values.
 
     Raises:
         NotRecreated: the options are not plain values.

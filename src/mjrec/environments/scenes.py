@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Facts about an environment that a monitor needs to record its states and frames."""
+"""The facts that a monitor needs to record an environment's states and frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class NoFrameSource:
     """The source of frames for an environment that cannot be drawn live.
 
     Args:
-        missing: what the environment lacks, and a remedy.
+        missing: a clause that states what is missing, and a remedy.
     """
 
     render_mode = None
@@ -103,7 +103,7 @@ def mujoco_warnings(env: Any) -> dict[str, int]:
 
 
 def new_warnings(before: Mapping[str, int], env: Any) -> dict[str, int]:
-    """Return MuJoCo's warnings by kind since `mujoco_warnings` returned `before`."""
+    """Return the counts of MuJoCo's warnings, by kind, that are not in `before`."""
     after = mujoco_warnings(env)
     # MuJoCo may reset an unstable simulation together with its counts.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
@@ -134,7 +134,7 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
 
 
 def has_own_method(instance: Any, name: str) -> bool:
-    """Return whether an object has its own method that replaces its class's method.
+    """Return whether an object has a method of its own, instead of its class's method.
 
     This function does not use `__dict__`, because in CPython 3.11 and 3.12, a single
     read makes every later access to the object's attributes several times slower. That
@@ -235,7 +235,7 @@ def shown_arguments(kwargs: Any) -> str:
 
 
 def shown_wrappers(environment: Mapping[str, Any]) -> list[str]:
-    """Return `Name(argument=value, ...)` for each wrapper, starting at the outermost.
+    """Return `Name(argument=value, ...)` for each wrapper, outermost first.
 
     Args:
         environment: the facts about the environment in a recording; any values are

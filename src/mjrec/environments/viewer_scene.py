@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene that Gymnasium's off-screen viewer shows, even before it is created.
+"""The scene that Gymnasium's off-screen viewer shows or would show.
 
-This module imports mujoco through `simulation`, so load it only if there is a
-simulation.
+This module imports mujoco through `simulation`. Load it only if there is a simulation.
 """
 
 from __future__ import annotations
@@ -101,7 +100,7 @@ class ViewerScene:
     def forget(self) -> None:
         """Treat the next frame as if it were the first.
 
-        A viewer that the environment already has is not changed.
+        An existing viewer is not changed.
         """
         self._start()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wrappers between a monitor and the environment that it records.
+"""The wrappers between a monitor and the recorded environment.
 
 A wrapper may change an action before the environment receives it, so recreating the
 environment includes recreating its wrappers.

@@ -5,7 +5,7 @@ All figures compare B with A: differences are B - A, and the probability of impr
 is the probability that B has a higher return than A. If each side is a single
 evaluation, the figures are computed from its episodes and apply only to these two
 policies. If a side has several evaluations, one per training run, the figures are
-computed from the mean returns of the evaluations and apply to the two methods. See
+computed from the evaluations' mean returns and apply to the two methods. See
 `docs/reference/statistics.md`.
 """
 
@@ -56,7 +56,7 @@ class TaskComparison:
             the mean returns of the evaluations. The paired difference uses episodes
             that began in the same state. The p-value is from the two-sided Mann-Whitney
             test and is adjusted for the number of tasks by Holm's method.
-        pairs: number of episode pairs that the paired difference is computed from.
+        pairs: number of episode pairs used for the paired difference.
         unknown: the reason why there are no figures; None if there are figures.
     """
 
@@ -241,7 +241,7 @@ class _Side:
         return _listed(each.plan.policy_and_kwargs for each in self.results)
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
-        """Return the tasks of this side except the given ones."""
+        """Return this side's tasks, excluding the given ones."""
         return tuple(task for task in self.tasks if task not in tasks)
 
     def returns(self, task: str) -> list[FloatArray]:
@@ -363,7 +363,7 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
 
 
 def _conditions(results: Evaluation) -> Mapping[str, object]:
-    """Return the conditions that affect the returns of a policy."""
+    """Return the conditions that affect a policy's returns."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 

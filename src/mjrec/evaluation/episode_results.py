@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The results of episodes, read from the journals in the directory of a chunk.
+"""Episode results, read from the journals in a chunk's directory.
 
-An episode of an evaluation has up to three lines in a journal. The line `begun` is
+An episode in an evaluation has up to three lines in a journal. The `begun` line is
 written before the reset. The line for the end of the episode is either the usual
 journal line with an additional field, `evaluation`, or a `failed` line::
 

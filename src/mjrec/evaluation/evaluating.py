@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`evaluate`, which distributes an evaluation to workers and writes the results.
 
-Workers record the episodes, one chunk at a time. The calling process does not simulate
-anything, and it needs OpenGL only to draw the videos at the end. It can be killed at
-any time: a resumed evaluation does not repeat finished work.
+Workers record the episodes, one chunk at a time. The calling process simulates nothing
+and needs OpenGL only to draw the videos at the end. It can be killed at any time: a
+resumed evaluation does not repeat finished work.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def evaluate(
     The trajectory of every episode is kept, so any episode can be rendered later. An
     episode fails if the policy or the environment raises an exception, or if an action
     is NaN or has the wrong shape. The other episodes still run. If a worker dies during
-    an episode, the episode is retried. It fails after three deaths.
+    an episode, the episode is retried. After three deaths, it fails.
 
     A worker creates the environment and the policy once per task and resets them for
     each episode. There are two exceptions. An environment that draws its model from the
@@ -126,14 +126,14 @@ def evaluate(
         num_seeds: number of seeds, counted from 0, instead of `seeds`. Defaults to 5.
         workers: number of worker processes, which also render. Defaults to one per
             usable CPU. If `engine` is a name, this is the number of the engine's
-            workers. The results do not depend on the number.
+            workers. The results do not depend on this number.
         keep: rule that chooses the episodes of each task for videos: `best[:N]`,
             `median`, `worst[:N]` and `failures[:N]`, joined by commas; or `cubic`,
             `all` or `none`. Defaults to `"best,median,worst"`.
         protocol: `"seeded"` (the default): episode i of seed s starts from
             `SeedSequence([s, i])`. `"suite"`: the episodes of a task and a seed s share
             one random stream, seeded with s.
-        resume: continue the evaluation in the directory without repeating finished
+        resume: continue the evaluation in the directory without rerunning finished
             episodes. Arguments that are None keep their earlier values. You may add
             tasks, seeds and (except with `"suite"`) episodes. Everything else must be
             the same, including the policy's code and weights.
@@ -154,7 +154,7 @@ def evaluate(
         score_ranges: for each task, the returns that correspond to scores of 0 and 1.
             Scores make tasks comparable. dm_control tasks have default ranges.
         confidence: confidence level of the intervals.
-        on_progress: called with the progress several times a second.
+        on_progress: a function that is called with the progress several times a second.
         engine: an executor to use instead of child processes, or `"local"`, `"ray"` or
             `"slurm"`. Its workers also render. All workers must see the directory under
             the same path. The results do not depend on the engine.

@@ -307,7 +307,7 @@ class _Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class _ResultsFile:
-    """The content of `results.json`, in the order of the file."""
+    """The content of `results.json`, in file order."""
 
     plan: Annotated[EvaluationPlan, _plan]
     selection: _Selection

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distribution of an evaluation to workers, from the start to the finished videos.
 
-The results of episodes are read from the chunks' journals, never from the return values
-of workers.
+The episodes' results are read from the chunks' journals, never from the workers' return
+values.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EvaluationProgress:
         failed: number of failed episodes.
         total: total number of episodes.
         videos_done: number of finished videos.
-        videos: total number of videos that are known so far.
+        videos: total number of videos known so far.
         frames_done: number of frames drawn so far; 0 if an engine's workers draw the
             videos.
         frames: total number of frames in the videos; 0 if an engine's workers draw the
@@ -72,7 +72,7 @@ _Tell = Callable[[EvaluationProgress], object]
 
 @dataclass
 class ChunkRun:
-    """The current state of a chunk of a task.
+    """The current state of a task's chunk.
 
     Attributes:
         task: the task.
@@ -151,7 +151,7 @@ def check_tasks(
             create an environment eventually, so all workers do so now, in parallel.
 
     Returns:
-        The plan with the tasks' step limits, and for each new task a rough measure of
+        The plan with the tasks' step limits, and for each new task, a rough measure of
         the cost of a step.
 
     Raises:
@@ -302,7 +302,7 @@ def choose_videos(
 def files_of(
     evaluation: Evaluation, chunks: Iterable[ChunkRun]
 ) -> Callable[[EpisodeResult], EpisodeFiles]:
-    """Return a function that looks up the files of an episode."""
+    """Return a function that looks up an episode's files."""
     chunk_of = _by_monitor(chunks)
     chosen = {
         (task, each.seed, each.episode)
@@ -401,7 +401,7 @@ def draw_videos(
 def _by_monitor(
     chunks: Iterable[ChunkRun],
 ) -> dict[tuple[str, str | None], ChunkRun]:
-    """Return the chunks, by task and by the monitors that recorded them."""
+    """Return the chunks, keyed by task and monitor."""
     return {
         (each.task.name, result.monitor): each
         for each in chunks

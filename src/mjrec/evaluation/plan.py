@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of an evaluation, the plan's chunks, and its file, `evaluation.json`.
+"""The plan of an evaluation, its chunks, and the file `evaluation.json`.
 
 The file is written before any episode runs.
 """
@@ -66,7 +66,7 @@ class EvaluatedTask:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Episodes of a task that one job runs and records in one monitor directory.
+    """Episodes of one task that a single job runs and records in one monitor directory.
 
     Attributes:
         folder: base name of the monitor directory in the folder of each task.
@@ -113,7 +113,7 @@ class EvaluationPlan:
         keep: rule that chooses the episodes for videos; see `recorder.keep_rules`.
         max_steps: number of steps after which an episode is truncated; None for the
             environment's own limit, or 1000 steps if it has no limit.
-        episode_timeout: seconds after which an episode fails; None for no timeout.
+        episode_timeout: timeout for an episode, in seconds; None for no timeout.
         camera: the camera for the videos; None for the model's tracking camera, if
             there is one.
         height: height of the videos; None for the environment's default.
@@ -173,7 +173,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
     """Read the plan of the evaluation in a directory.
 
     Raises:
-        UnreadableFile: the plan is missing, damaged or in a different format version.
+        UnreadableFile: the plan is missing, damaged or of a different format version.
     """
     path = directory / PLAN_NAME
     with unreadable(path):
@@ -192,7 +192,7 @@ def read_versioned(path: Path) -> Mapping[str, Any]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file contains no JSON object of this version.
+        ValueError: the file does not contain a JSON object in this format version.
     """
     value = json_fields.read_object(path)
     version = json_fields.field(value, "format_version", json_fields.integer)
@@ -212,7 +212,7 @@ def check_continues(
     The new plan may have different tasks, additional seeds and more episodes. With the
     protocol `"suite"`, it must not have more episodes, because all episodes of a seed
     form one unit of work. Any other difference would change results or videos. Episodes
-    must not be dropped, because their returns may already be known.
+    must not be dropped, because the user may already have seen their returns.
 
     Args:
         directory: the evaluation's directory, for the error message.

@@ -31,7 +31,7 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True)
 class Requirement:
-    """A requirement on a figure of a comparison.
+    """A requirement for a figure in a comparison.
 
     Attributes:
         text: the requirement as the user wrote it.

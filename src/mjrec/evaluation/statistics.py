@@ -206,7 +206,7 @@ def mean(sample: FloatArray) -> Figure:
 
 
 def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
-    """Return the mean of the middle half of all samples pooled together.
+    """Return the mean of the middle half of the pooled samples.
 
     Of all n values, the floor(n / 4) smallest and the floor(n / 4) largest are left
     out. Larger samples have more weight.
@@ -290,7 +290,7 @@ def improvement(x: FloatArray, y: FloatArray) -> Figure:
 
 
 def _placements(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the share of `y` below each value of `x`. Ties count as one half."""
+    """Return the share of `y` below each value in `x`. Ties count as one half."""
     y = np.sort(y)
     below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
     return np.asarray((below + up_to) / (2 * len(y)))

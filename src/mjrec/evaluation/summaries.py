@@ -33,8 +33,8 @@ class TaskSummary:
 
     Attributes:
         task: the task's name.
-        runs: number of seeds with episodes, or of monitors if a monitor directory is
-            summarized.
+        runs: number of seeds with episodes, or number of monitors if a monitor
+            directory is summarized.
         episodes: number of completed episodes. The figures are computed from these.
         failed: number of failed episodes.
         mean: mean return.
@@ -48,8 +48,8 @@ class TaskSummary:
         mean_length: mean length of the episodes, in steps.
         terminated: number of episodes that the task ended.
         truncated: number of episodes that a limit outside the task ended.
-        success_known: number of episodes for which success or its absence is known. If
-            the task reports success, failed episodes count as unsuccessful.
+        success_known: number of episodes known to be successful or unsuccessful. If the
+            task reports success, failed episodes count as unsuccessful.
         success_rate: share of successful episodes among the `success_known` episodes.
         success_interval: Wilson's interval for the success rate.
         warnings: number of MuJoCo warnings, by kind.
@@ -151,8 +151,9 @@ def summarize_task(
 ) -> TaskSummary:
     """Summarize the episodes of one task.
 
-    All arrays have one element per completed episode, in the same order. Changing the
-    order affects the figures only by rounding errors. A million episodes take a second.
+    All arrays have one element per completed episode, in the same order. The order
+    affects the figures only by rounding errors. Summarizing a million episodes takes a
+    second.
 
     Args:
         task: the task's name.

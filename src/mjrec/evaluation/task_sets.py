@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Task names that users give: environments, sets of environments and patterns.
+"""User-specified task names: environments, sets of environments and patterns.
 
 ======================  ==============================================================
 `HalfCheetah-v5`        an environment as in `mjrec record`: a Gymnasium id,

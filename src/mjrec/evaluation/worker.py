@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The worker process of an evaluation, which runs the missing episodes of chunks.
+"""An evaluation's worker process, which runs the missing episodes in chunks.
 
 The settings are `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`.
 If the policy is an object, `"payload"` is the path of the file with the pickled policy.
@@ -88,7 +88,7 @@ class Acting:
 
     Attributes:
         task: the environment's name.
-        seed: the seed that the environment was created with.
+        seed: the seed used to create the environment.
         named: the environment.
         policy: the policy.
         is_drawn_live: whether frames are drawn while the environment is stepped.
@@ -105,7 +105,7 @@ class EvaluationWorker:
     """A handler for `engines.jobs` that runs an evaluation's jobs.
 
     Args:
-        settings: the settings, which the module docstring describes.
+        settings: the settings, as described in the module docstring.
 
     Attributes:
         plan: the plan of the evaluation, without its chunks.
@@ -269,7 +269,7 @@ class _ChunkRun:
         self._open = contextlib.ExitStack()
 
     def run(self) -> None:
-        """Run the episodes that have no result yet.
+        """Run the episodes that have no results yet.
 
         No other process may write to the folder, and the recordings of killed processes
         must have been recovered.

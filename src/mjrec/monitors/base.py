@@ -121,7 +121,7 @@ class MonitorBase:
         logger.warning("%s", error)
 
     def _finish(self, on_progress: Callable[[Any], None]) -> None:
-        """End all episodes, then wait until all videos are rendered."""
+        """End all episodes, and wait until all videos are rendered."""
         call_all(functools.partial(r.finish, on_progress) for r in self._recorders)
 
     def _note_error(self, error: BaseException) -> None:
@@ -181,7 +181,7 @@ class EnvironmentMonitor(MonitorBase):
 
     @property
     def infix(self) -> str:
-        """The middle part of the names of this monitor's files."""
+        """The middle part of this monitor's file names."""
         return self._recorder.infix
 
     @property
@@ -203,24 +203,24 @@ class EnvironmentMonitor(MonitorBase):
         return self._recorder.video_recorder
 
     def get_episode_rewards(self) -> list[float]:
-        """Return the sum of rewards of each complete episode."""
+        """Return the sum of rewards for each complete episode."""
         return list(self._recorder.stats_recorder.episode_rewards)
 
     def get_episode_lengths(self) -> list[int]:
-        """Return the number of steps of each complete episode."""
+        """Return the number of steps in each complete episode."""
         return list(self._recorder.stats_recorder.episode_lengths)
 
     def model_changed(self) -> None:
         """Declare that a texture, height field or mesh changed during an episode.
 
         Other visible changes, and all changes at a reset, are detected automatically.
-        The next recorded frame shows the change. Changed physical constants (masses,
+        The next recorded frame shows the change. Changes to physical constants (masses,
         damping) are then also stored in the trajectory, for replays.
         """
         self._recorder.model_changed()
 
     def forget_frames(self) -> None:
-        """Make the next episode look like the first one of a new environment.
+        """Make the next episode look like the first episode of a new environment.
 
         Gymnasium places its free camera at the first frame, and infinite planes and
         tracking cameras depend on the previous frame. So an episode can look different
@@ -362,7 +362,7 @@ def rendering_choice(
 
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:
-    """Call all functions, even if some raise; then raise the first exception."""
+    """Call all functions, even if some raise an exception; then raise the first one."""
     first: BaseException | None = None
     for call in calls:
         try:

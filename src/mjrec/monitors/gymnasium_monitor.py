@@ -71,7 +71,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
     # Gymnasium's own wrappers also override the attribute with a property.
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The environment's own spec, which creates unmonitored environments."""
+        """The environment's own spec, which creates environments without monitors."""
         return self.env.spec
 
     def reset(

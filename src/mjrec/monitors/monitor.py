@@ -67,9 +67,9 @@ def Monitor(  # noqa: N802  named like gym's class
             observation, info = env.reset(seed=0)
 
     If the state of a MuJoCo environment determines its frames, `step` only saves the
-    state, and worker processes render the frames, byte for byte as `env.render()` would
-    at that moment. Any recorded episode can be rerendered (`mjrec.render`). Other
-    environments are rendered in `step`, with their own `render()`.
+    state, and worker processes render frames that are byte-identical to those of
+    `env.render()`. Any recorded episode can be rerendered (`mjrec.render`). Other
+    environments are rendered during `step`, with their own `render()`.
 
     Args:
         env: a Gymnasium environment, a vector environment (see `VectorMonitor`), or a
@@ -84,7 +84,7 @@ def Monitor(  # noqa: N802  named like gym's class
         resume: add to existing recordings. Killed monitors are recovered first, as by
             `mjrec.recover`. Episode numbers continue from the highest number of all
             closed or dead monitors (with `uid`, only of those with this `uid`).
-            Monitors that use a directory at the same time all need `resume`, and number
+            Monitors that use a directory simultaneously all need `resume`, and number
             their episodes independently. `"join"` does not read other monitors' files,
             so it is fast even among thousands of monitors: it recovers nothing, numbers
             episodes from 0, and does not check that the environments are the same.
@@ -177,8 +177,8 @@ def Monitor(  # noqa: N802  named like gym's class
         ExistingRecordings: the directory contains recordings, and neither `force` nor
             `resume` was given.
         DirectoryInUse: `force` was given, but another monitor is recording there.
-        DifferentEnvironment: `resume` was given, but the recordings are of a different
-            environment.
+        DifferentEnvironment: `resume` was given, but the recordings are from a
+            different environment.
         DirectoryNotWritable: the directory cannot be created or written to.
 
     If an error is raised, `env` is unchanged and no files are left.
@@ -195,7 +195,7 @@ def Monitor(  # noqa: N802  named like gym's class
 def monitored(
     env: Any, directory: str | os.PathLike[str], options: RecorderOptions, **view: Any
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
-    """Create a monitor, as `Monitor` does, from an options object.
+    """Create a monitor like `Monitor`, but from an options object.
 
     Args:
         env: see `Monitor`.

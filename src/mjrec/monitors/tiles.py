@@ -210,7 +210,7 @@ class TiledVideo:
         self._ending: dict[str, Any] | None = None
 
     def take_last(self) -> None:
-        """Take the frame of the last step, if it was left out."""
+        """Take the frame of the last step if it was skipped."""
         if self._live is not None and self._ending is None:
             self._live.take_last()
 

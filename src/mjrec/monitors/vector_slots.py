@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The individual sub-environments of a vector environment.
+"""The individual sub-environments in a vector environment.
 
 Sub-environments that are objects in this process are in the vector environment's list.
 All others are visible only from outside, as slots in the inputs and outputs of the
@@ -58,7 +58,7 @@ def autoreset_mode(env: VectorEnv) -> str:
 
 
 def environments_inside(env: VectorEnv) -> list[Env] | None:
-    """Return a vector environment's own list of its sub-environments.
+    """Return a vector environment's own list of sub-environments.
 
     The result is None if they are not objects in this process.
     """
@@ -205,7 +205,7 @@ def env_id_outside(env: VectorEnv) -> str:
 
 
 def way_out(env: VectorEnv) -> str:
-    """Return advice on how to record states and all frames anyway."""
+    """Return advice on how to record the states and all frames."""
     if is_async(env):
         return (
             "Put Monitor around each of them, inside the functions that create them: "

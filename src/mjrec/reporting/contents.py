@@ -98,7 +98,7 @@ class ReportTask:
             For monitors, `seed` is the index into `runs`, and `start_time` is the end
             time.
         runs: the names of the runs if they are monitors.
-        failures: the reasons why episodes failed, by index.
+        failures: the reasons why episodes failed, keyed by index.
         videos: the videos, in the order of their episodes.
         provenance: human-readable pairs of label and value: versions, GL renderer,
             policy, seeds, selection rule, protocol ...
@@ -141,7 +141,7 @@ class ReportContents:
         title: the page's title.
         tasks: the tasks, in the order used on the page.
         across: for each evaluation, the statistics across tasks, keyed by directory.
-        bootstrap: the settings for intervals.
+        bootstrap: the settings for the intervals.
         problems: sentences about items that could not be read or shown.
         verdicts: the verdicts from verifications.
     """
@@ -212,7 +212,7 @@ def find_episodes(
     Args:
         videos: the videos.
         rows: the episodes.
-        monitors: the infixes of the monitors that recorded them.
+        monitors: the infixes of the monitors that recorded the episodes.
     """
     number = {infix: index for index, infix in enumerate(monitors)}
     for video in videos:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SVG figures for a report's page, in the page's colors.
+"""SVG figures for a report's page, drawn in the page's colors.
 
 Each function returns one `<svg>` element for an HTML page. The element uses classes
 instead of colors (`f-` for fills, `s-` for strokes, such as `s-accent`), so that one
@@ -163,7 +163,7 @@ def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
 def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
     """Return the runs, returns and end times of the episodes with finite returns.
 
-    Returns are clipped so that their sums are finite, too.
+    Returns are clipped so that their sums are also finite.
     """
     known = task.episodes[np.isfinite(task.episodes["total_reward"])]
     returns = np.clip(known["total_reward"], -_LARGEST, _LARGEST)
@@ -194,7 +194,7 @@ def _spread(count: int, most: int) -> NDArray[np.intp]:
 def _draw_seeds(
     panel: _Panel, returns: _Floats, place: NDArray[np.intp], seeds: int
 ) -> None:
-    """Draw each seed's episodes from left to right in its column, and their mean."""
+    """Draw each seed's episodes from left to right in one column, and their mean."""
     for seed in range(seeds):
         of_seed = returns[place == seed]
         chosen = _spread(len(of_seed), max(20, _MOST_DOTS // seeds))
@@ -330,7 +330,7 @@ class _Panel:
 
 
 def _joined(points: Sequence[Sequence[float]]) -> str:
-    """Return the data of a path through points; empty if there are none."""
+    """Return the data for a path through points; empty without points."""
     joined = "L".join(f"{x:g} {y:g}" for x, y in points)
     return f"M{joined}" if joined else ""
 

@@ -165,7 +165,7 @@ def _has_episodes(files: MonitorFiles) -> bool:
 
 @dataclass
 class _Recorded:
-    """The recordings of one environment by all monitors, in compact form."""
+    """All monitors' recordings of one environment, in compact form."""
 
     # Only distinct pairs, in order, because there may be thousands of monitors.
     provenance: dict[tuple[str, str], None] = field(default_factory=dict)
@@ -358,8 +358,8 @@ def _read_verdict(path: Path) -> Verdict:
     """Return the verdict in output from `mjrec verify --json`.
 
     Raises:
-        UnreadableFile: the file is missing, damaged, of a different kind, or
-            contradicts itself.
+        UnreadableFile: the file is missing, damaged, inconsistent or of a different
+            kind.
     """
     with unreadable(path):
         verification = read_object(path)

@@ -68,8 +68,8 @@ def is_own_name(name: str) -> bool:
 def add_images(contents: ReportContents, on_progress: OnProgress) -> None:
     """Set the still image of each video, except for text recordings and broken videos.
 
-    Missing durations of videos are filled in. Videos that cannot be decoded are added
-    to the problems.
+    Missing video durations are filled in. Videos that cannot be decoded are listed as
+    problems.
 
     Args:
         contents: the contents, whose videos still have their recorded files.

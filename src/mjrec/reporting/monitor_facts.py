@@ -316,7 +316,7 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _known(facts: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:
-    """Return a field of the metadata; None if it is missing or invalid."""
+    """Return a field from the metadata; None if it is missing or invalid."""
     try:
         return field(facts, key, read)
     except ValueError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HTML page of a report, which opens from disk without a network.
+"""A report's HTML page, which opens from disk and needs no network.
 
 Everything on the page may come from untrusted files. It is shown as text: escaped,
 shortened if too long, with invisible characters spelled out. A content security policy
@@ -51,7 +51,7 @@ _Pairs = Sequence[tuple[str, str]]
 
 
 def page_of(contents: ReportContents) -> str:
-    """Return the HTML of a report's page.
+    """Return a report's HTML page.
 
     The same contents yield the same HTML. If there are more than 20,000 episodes, the
     table contains only those with videos, those that failed, and each task's best and
@@ -291,7 +291,7 @@ def _card(
 
 
 def _selection(tasks: Iterable[ReportTask]) -> list[str]:
-    """Return the rules that chose the episodes with videos, from the provenance."""
+    """Return the rules that chose the episodes for videos, from the provenance."""
     said = (pair for task in tasks for pair in task.provenance)
     rules = (value for label, value in said if label == SELECTION)
     return list(dict.fromkeys(rules))[:10]

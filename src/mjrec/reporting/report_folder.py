@@ -10,7 +10,7 @@
     └── replays/        3D pages of some: 0000-dm-control-walker-walk.html ...
 
 The folder can be moved, and does not need the recordings. It gets its final name only
-when it is complete. It then replaces an existing folder if that contains only a report.
+when complete. It then replaces an existing folder if that contains only a report.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, given by name, by number or as an `MjvCamera`, and the cameras of a model.
+"""Cameras: finding them by name or number, and choosing a model's default camera.
 
 Every function accepts MuJoCo's own objects or wrappers around them. A wrapper holds the
 original object in `.ptr`, as in dm_control.
@@ -36,7 +36,7 @@ _TRAVELLING_JOINTS = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT
 
 
 def raw_model(model: Any) -> mujoco.MjModel:
-    """Return the `mujoco.MjModel` that `model` is or wraps.
+    """Return `model`, or the `mujoco.MjModel` that it wraps.
 
     Raises:
         InvalidArgument: `model` is neither a model nor a wrapper around one.
@@ -45,7 +45,7 @@ def raw_model(model: Any) -> mujoco.MjModel:
 
 
 def raw_data(data: Any) -> mujoco.MjData:
-    """Return the `mujoco.MjData` that `data` is or wraps.
+    """Return `data`, or the `mujoco.MjData` that it wraps.
 
     Raises:
         InvalidArgument: `data` is neither an `MjData` nor a wrapper around one.
@@ -98,7 +98,7 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
 
 
 def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Check that the model has the body or the fixed camera that a camera refers to.
+    """Check that the model has the body or the fixed camera to which a camera refers.
 
     Raises:
         InvalidArgument: the model lacks this body or camera, or the type is invalid.
@@ -131,10 +131,10 @@ def tracking_camera(model: Any) -> str | int | None:
     """Return the camera in the model that follows the robot, if there is one.
 
     This is the first camera that follows the center of mass of a body's subtree
-    (`mode="trackcom"`). If there is no such camera, it is the first one that follows a
-    body (`mode="track"`) of a robot that can travel, because a free or sliding joint
-    connects it to the world. An arm with a fixed base cannot travel, and a camera that
-    follows its hand is a close-up.
+    (`mode="trackcom"`). If there is none, it is the first camera that follows a body
+    (`mode="track"`) of a robot that can travel, that is, has a free or sliding joint to
+    the world. An arm with a fixed base cannot travel, and a camera that follows its
+    hand is a close-up.
 
     Returns:
         The camera's name, or its number if it has no name. None if no camera follows

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The capture of states from the MuJoCo simulation inside an environment."""
+"""Capture of states from the MuJoCo simulation inside an environment."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class EpisodeStart:
         model: the stored model's facts, for the trajectory.
         scene: the scene's facts, for the trajectory; None without snapshots.
         model_fields: the fields that differ from the stored model.
-        refusal: the reason why no frame can be drawn from snapshots of this model; None
-            if a check found that frames can be drawn.
+        refusal: the reason why snapshots of this model are not enough to draw frames;
+            None if a check found that they are.
         words: the indices in `raw_memory.WORDS` for gathering rows of state and
             snapshot while `is_current` returns True; None if each capture must check
             for changes.
@@ -82,9 +82,8 @@ class Capture:
         view: a function that returns the view of the scene, called when an episode
             begins. The view's camera and option may be the environment's own, so they
             are watched for changes.
-        at_frame: a function that calls its argument at the moment at which the
-            environment would draw, and then restores everything; None if any moment
-            will do.
+        at_frame: a function that calls its argument at the moment when the environment
+            would draw, and then restores the simulation; None if any moment will do.
         resetting: a function that returns a context manager for each reset.
         authored: a function that returns the model's sources, or None if unknown.
         obstacle: a function that returns the reason why the current frame cannot be
@@ -224,7 +223,7 @@ class Capture:
             self._stored.scene = None
 
     def settle(self) -> None:
-        """Wait until no model is left to be stored; `finish` reports any failures."""
+        """Wait until no model is left to store; `finish` reports any failures."""
         if self._store is not None:
             self._store.settle()
 
@@ -266,7 +265,7 @@ class Capture:
         view: SceneView,
         fields: Iterable[str],
     ) -> _Frames:
-        """Return the last source of snapshots if it still fits, otherwise a new one."""
+        """Return the last snapshot source if it is still valid, otherwise a new one."""
         stored.looks.follow(view)
         key = (
             *(data._address, id(view.camera), id(view.option), view.max_geom),
@@ -356,7 +355,7 @@ class _Frames:
     positions without drawing.
 
     Attributes:
-        key: everything that this object depends on, for comparison.
+        key: everything on which this object depends, for comparison.
         kind: the snapshots' dtype.
         source: the source of the snapshots.
         words: the indices of a row's words; None if a row cannot be gathered.

@@ -99,10 +99,10 @@ def has_limited_tendons(model: mujoco.MjModel) -> bool:
 
 
 def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:
-    """Return the reason why no snapshot suffices for `option`, or None if one does.
+    """Return the reason why snapshots are not enough for `option`, or None if they are.
 
-    Contacts, constraint islands and joints at their limits are drawn from the
-    constraints of a step.
+    Contacts, constraint islands and joints at their limits are drawn from a step's
+    constraints.
     """
     shown = [name for name in _CONSTRAINT_FLAGS if _flag(option, name)]
     if _flag(option, "mjVIS_ISLAND") and _has_islands(model):

@@ -46,7 +46,7 @@ def struct_names() -> tuple[str, ...]:
 
 @functools.cache
 def empty_model() -> mujoco.MjModel:
-    """Return an empty model, which must not be modified."""
+    """Return an empty model. Do not modify it."""
     return mujoco.MjModel.from_xml_string("<mujoco/>")
 
 
@@ -134,9 +134,9 @@ def apply_fields(
 def is_settable(name: str) -> bool:
     """Return whether a model's field may be set to a value from a file.
 
-    MuJoCo trusts types, addresses and most indices in a model: a wrong value makes it
-    read out of bounds. Floating-point numbers, flags, texture data and indices that can
-    be checked are settable.
+    MuJoCo trusts types, addresses and most indices in a model, so a wrong value makes
+    it read out of bounds. Floating-point numbers, flags, texture data and indices that
+    can be checked are settable.
     """
     if "." in name or name in _INDICES or _INTEGERS.fullmatch(name):
         return True

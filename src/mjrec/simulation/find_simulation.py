@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that find the MuJoCo simulation inside an environment, by duck typing.
 
-They import nothing, because an environment without a simulation must not load MuJoCo,
-which chooses its OpenGL backend on import.
+They import nothing, because MuJoCo chooses its OpenGL backend on import and must not be
+loaded for an environment without a simulation.
 """
 
 from __future__ import annotations

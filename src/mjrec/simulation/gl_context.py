@@ -43,8 +43,8 @@ def new_context() -> Any:
     context current again, with `context_kept`.
 
     Raises:
-        GLError: no context can be created here, or this process was forked from one
-            that had created contexts.
+        GLError: no context can be created here, or this process was forked from a
+            process that had created contexts.
     """
     global _has_made_context
     refuse_fork_of_gl()
@@ -134,10 +134,10 @@ def current_gl_facts() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def context_kept(*, or_none: bool = False) -> Iterator[None]:
-    """After the block, restore the context that was current before it.
+    """Restore, after the block, the context that was current before it.
 
-    This works only with EGL. The other backends cannot make another library's context
-    current: with them, the block's context stays current.
+    This works only with EGL. Other backends cannot make another library's context
+    current, so the block's context stays current.
 
     Args:
         or_none: whether to end without a current context if there was none before. If

@@ -111,8 +111,8 @@ def draw_test_scene(
         A function that draws the scene again, and metadata about the driver.
 
     Raises:
-        WrongFrame: the frame does not show what it should.
-        Exception: any other error; drivers raise all kinds of errors.
+        WrongFrame: the frame does not show the expected scene.
+        Exception: any other error, because drivers may raise any type.
     """
     # Imported here because these imports are part of the test.
     import mujoco
@@ -197,7 +197,7 @@ def _load(library: str) -> str:
 
 
 def _vendor_notes() -> Iterator[str]:
-    """Yield notes about the drivers that libEGL finds by its own rules."""
+    """Yield notes about the drivers that libEGL would find."""
     names = os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES", "")
     directories = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", "") or _VENDOR_DIRECTORIES
     files = (

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes in a model and its view, found by comparing memory.
 
-Comparing some 500 arrays one by one takes longer than a simulation step. But all of
-them are in one allocation, and the structs `opt`, `vis` and `stat` follow one another
-in `mjModel` itself. So comparing a few long pieces is enough to show that nothing has
+Comparing some 500 arrays one by one takes longer than a simulation step. But all arrays
+are in one allocation, and the structs `opt`, `vis` and `stat` follow one another in
+`mjModel` itself. So comparing a few long pieces is enough to show that nothing has
 changed, which is the usual case. Only a piece that differs is examined field by field.
 """
 
@@ -41,12 +41,12 @@ class Looks:
     """A record of the fields of a model and a view, for finding the changed fields.
 
     At a reset, all fields of the model are compared. Between resets, only the fields
-    that each frame is drawn from are compared. Textures and meshes are not among them,
-    because they must be uploaded to the graphics card. The model is not modified, and
-    it is kept alive.
+    used for each frame are compared. They do not include textures and meshes, which
+    must be uploaded to the graphics card. The model is not modified, and it is kept
+    alive.
 
     Args:
-        model: the model, as it is stored now.
+        model: the model in its currently stored form.
 
     Attributes:
         seen: the watched memory in pieces, as of the last look. `follow` may replace
@@ -121,7 +121,7 @@ class Looks:
 
 
 class _Piece:
-    """A piece of memory, as it was at the start (`stored`) and the last look (`seen`).
+    """A piece of memory, with its bytes at the start (`stored`) and last look (`seen`).
 
     Memory that is not watched at each step may be large, so the two share one copy of
     it until something changes.

@@ -47,7 +47,7 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
 class MjcfSimulation:
     """A simulation in whole physics steps, at 60 frames per simulated second.
 
-    Frame k is taken after the whole number of steps that comes closest to k/60 seconds.
+    Frame k is taken after the whole number of steps that is closest to k/60 seconds.
     With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart. A frame is
     never more than half a step off, and errors do not accumulate. If the timestep is
     longer than 1/60 second, each frame is one step, and the frame rate is one over the

@@ -144,7 +144,7 @@ def read_authored(path: Path) -> mujoco.MjModel:
 
 
 def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with all textures embedded, even those it only refers to."""
+    """Return the model with all textures embedded, including those it refers to."""
     # MuJoCo 3.17 introduced such textures. Their address in the model is negative.
     if not hasattr(mujoco, "mj_embedAssets") or not (model.tex_adr < 0).any():
         return model
@@ -192,7 +192,7 @@ class _References:
     Attributes:
         xml: other MJCF files.
         assets: all other files.
-        directories: the directories in which the other files are looked up.
+        directories: the directories to search for the other files.
         go_up: whether a path leaves a folder with `..`.
 
     Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of the recordings in a directory, each stored once.
+"""The models used in a directory's recordings, each stored once.
 
 ::
 
@@ -9,7 +9,7 @@
 
 The digits are the beginning of the compiled model's SHA-256. Only the MuJoCo version
 that compiled a model can load it. The zip file is for all other versions, and for all
-users except the one who stored the model (see `model_trust`).
+users other than the user who stored the model (see `model_trust`).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class ModelStore:
         }
 
     def finish(self) -> None:
-        """Wait until every model is stored. More models may be added afterwards.
+        """Wait until every model is stored. Additional models may be added afterwards.
 
         Raises:
             FileNotWritten: a model could not be stored. The next call tries again.

@@ -2,8 +2,8 @@
 """The list of compiled models that this user has stored; no other models are loaded.
 
 MuJoCo trusts the addresses and types in a compiled model, so loading a crafted model
-can run any code. The hashes in a directory prove nothing, because its author wrote them
-too. So the models that this user stores are listed where only this user can write::
+can run any code. The hashes in a directory prove nothing, because anyone can write
+them. So the models that this user stores are listed where only this user can write::
 
     $XDG_STATE_HOME/mjrec/models       the sha256 of each model and of the path of its
                                        directory, one per line
@@ -116,7 +116,7 @@ def directory_digest(directory: Path) -> str:
     """Return the digest that represents a directory in the list of models.
 
     The digest identifies the directory by its path. A directory that was moved or
-    copied is untrusted, which only delays reading from it.
+    copied is untrusted, which only slows down reading.
     """
     place = f"directory {os.path.realpath(directory)}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
@@ -203,7 +203,7 @@ def _listed() -> str:
 
 
 def _append(directory: Path, digests: Iterable[str]) -> None:
-    """Append to the list in a directory, creating it if necessary.
+    """Append to the list in a directory, creating the list if necessary.
 
     Raises:
         OSError: the list cannot be written, or others can open it.
@@ -238,7 +238,7 @@ def _opened(path: Path, flags: int) -> Iterator[int]:
 
 
 def _check(path: Path, facts: os.stat_result, kind: int, *, mode: int) -> None:
-    """Raise PermissionError if others may have written to a path."""
+    """Raise PermissionError if other users may have written to a path."""
     if stat.S_IFMT(facts.st_mode) != kind or facts.st_uid != os.geteuid():
         raise PermissionError(f"{path} belongs to another user, or is a link or pipe")
     if facts.st_mode & (stat.S_IRWXG | stat.S_IRWXO):

@@ -2,9 +2,9 @@
 """Access to a simulation's memory, for gathering or comparing many arrays together.
 
 The arrays of an `MjData` keep their addresses as long as it exists, and so do our own
-arrays. `WORDS` presents the whole memory of this process as one long array of 64-bit
-words. `WORDS.take(index, None, out, "clip")` gathers a row from it, at a tenth of the
-cost of copying each array. Only the indexed words are ever read.
+arrays. `WORDS` represents the whole memory of this process as one long array of 64-bit
+words. `WORDS.take(index, None, out, "clip")` gathers a row from it in a tenth of the
+time needed to copy each array. Only the indexed words are ever read.
 """
 
 from __future__ import annotations

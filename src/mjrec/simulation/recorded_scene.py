@@ -124,7 +124,7 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
     """Return `states` as an `(n, size)` array of float64.
 
     Args:
-        model: a `mujoco.MjModel`, or dm_control's wrapper of one.
+        model: a `mujoco.MjModel`, or dm_control's wrapper around one.
         states: one row per state.
         spec: the components of a row, a combination of `mujoco.mjtState` flags.
 
@@ -180,7 +180,7 @@ class GivenStates:
     missing from the rows are as in a new `MjData`, so a frame depends only on its row.
 
     Args:
-        directory: the directory that `save_states` wrote to.
+        directory: the directory to which `save_states` wrote.
         spec: the components of a row.
 
     Attributes:

@@ -58,8 +58,8 @@ class Canvas:
     context's copy of the model is up to date.
 
     Args:
-        is_alone: whether nothing else draws in this process, so that the context can
-            stay current on its thread.
+        is_alone: whether no other code draws in this process; the context then stays
+            current on its thread.
 
     Attributes:
         gl_facts: metadata about the driver; see `current_gl_facts`.
@@ -166,7 +166,7 @@ class Canvas:
             yield
 
     def _load(self, model: mujoco.MjModel) -> None:
-        """Copy into the context the parts of a model that it keeps."""
+        """Copy a model to the context, which keeps parts of it."""
         height, width = self._rectangle.height, self._rectangle.width
         with self._current():
             # The longest side that the driver supports.
@@ -216,8 +216,8 @@ class SceneRenderer:
 
     MuJoCo's visualizer remembers the previous frame: an infinite plane is drawn around
     the cameras' positions in that frame, and a camera that tracks a body moves part of
-    the way toward the body in each frame. `look` brings the renderer to a later frame
-    as if all previous frames had been drawn.
+    the way toward the body in each frame. `look` updates this memory as if the frame
+    had been drawn.
 
     ::
 
@@ -251,8 +251,8 @@ class SceneRenderer:
         UnknownName: the model has no such camera, or the quality is unknown.
         InvalidArgument: the camera's number or the size is invalid, or the driver
             cannot draw this size.
-        GLError: no OpenGL backend works here, or this process was forked from one that
-            had used OpenGL.
+        GLError: no OpenGL backend works here, or this process was forked from a process
+            that had used OpenGL.
     """
 
     def __init__(
@@ -328,7 +328,7 @@ class SceneRenderer:
         """Bring the canvas up to date with the model.
 
         This compares the parts of the model that an OpenGL context keeps, and copies
-        them again if any has changed. With large textures, it takes milliseconds.
+        them again if any has changed. This takes milliseconds with large textures.
 
         Raises:
             GLError: see `render`.

@@ -7,9 +7,9 @@ about. Building a scene takes microseconds and needs no OpenGL. So one scene is 
 from the live data and another from the restored snapshot, and they must be equal.
 
 Checking one scene is not enough for plugins. For each scene, MuJoCo calls a plugin's
-`visualize`, which may draw from the plugin's own memory, and may do so only sometimes:
-a touch grid draws nothing until something touches it. So models with plugins are
-recorded live.
+`visualize`, which may draw from the plugin's own memory, but not in every scene: a
+touch grid draws nothing until something touches it. So models with plugins are recorded
+live.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class SnapshotSource:
         kind: the dtype that `snapshot_dtype` returned for the model.
 
     Attributes:
-        words: the snapshot's indices into `raw_memory.WORDS`; None if the snapshot
-            cannot be gathered, or if it includes arrays that are not the data's own.
+        words: the snapshot's indices in `raw_memory.WORDS`; None if the snapshot cannot
+            be gathered, or if it includes arrays from outside the data.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> No
 
     Raises:
         InvalidArgument: a tendon refers to something that is not in the model, which
-            MuJoCo would not notice.
+            MuJoCo would not detect.
     """
     names = row.dtype.names or ()
     for name in names:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a simulation, and functions that read, set and preserve it.
 
-The state is `mjSTATE_INTEGRATION`: everything that the next step depends on. MuJoCo
-returns it as one vector whose components are identified by bits. The bits have been
-renumbered between releases, so recordings identify components by name.
+The state is `mjSTATE_INTEGRATION`: everything on which the next step depends. MuJoCo
+returns the state as one vector whose components are identified by bits. The bits have
+been renumbered between releases, so recordings identify components by name.
 """
 
 from __future__ import annotations

@@ -36,8 +36,8 @@ def load_trajectory(
     """Load a recorded episode.
 
     Args:
-        path: the episode's file, `openaigym.trajectory.*.h5`. While the episode runs,
-            or if its process was killed, this file does not exist yet, and the
+        path: the episode's file, `openaigym.trajectory.*.h5`. If the episode is still
+            running, or its process was killed, this file does not exist, and the
             monitor's log is read instead.
         trust_models: whether `model()` and `mjrec.render` may load a compiled model
             that another user or machine wrote. A crafted model can run any code. If
@@ -79,7 +79,7 @@ class Trajectory:
 
     In addition to `ctrl`, the inputs are `qfrc_applied`, `xfrc_applied`, `eq_active`,
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
-    is the input of the environment, which need not be the input of the actuators.
+    is the input to the environment, which may differ from the input to the actuators.
 
     Snapshots and changes to the model are read on demand; all other data is in memory.
 
@@ -172,7 +172,7 @@ class Trajectory:
 
     @property
     def complete(self) -> bool:
-        """Whether the episode was recorded to its end."""
+        """Whether the episode was recorded to the end."""
         return bool(self.facts.get("complete", False))
 
     @property
@@ -187,7 +187,7 @@ class Trajectory:
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """The arrays that frames are drawn from, `(F, *shape)`, by their MuJoCo names.
+        """The arrays used to draw frames, `(F, *shape)`, keyed by their MuJoCo names.
 
         Raises:
             UnreadableFile: the file has been removed or is damaged.

@@ -29,9 +29,9 @@ class SceneView:
     """Everything that a frame depends on, except the model and data.
 
     Attributes:
-        camera: the environment's own live camera, or one of ours.
-        option: the visual options, which are the environment's own or ours. They are
-            not always MuJoCo's defaults.
+        camera: the environment's own live camera, or a camera created by mjrec.
+        option: the visual options, from the environment or from mjrec. They are not
+            always MuJoCo's defaults.
         max_geom: maximum number of geoms in the scene; additional geoms are not drawn.
         fresh: whether each frame gets a new scene, as in dm_control. In a reused
             scene, an infinite plane is drawn around the camera of the previous frame.
@@ -63,7 +63,7 @@ class SceneView:
 
 
 def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
-    """Return the view that `SceneView.facts` described.
+    """Return the view described by the result of `SceneView.facts`.
 
     Raises:
         InvalidArgument: a value is missing or invalid. The facts may come from a file.

@@ -20,7 +20,7 @@ def log_mujoco_warnings() -> None:
 
     MuJoCo itself would write `MUJOCO_LOG.TXT` to the working directory. A full scene,
     for example, causes a warning at each frame. Use this only in processes that mjrec
-    starts, because a process can have only one handler.
+    starts, because a process can have only one warning handler.
     """
     warned: set[str] = set()
 
