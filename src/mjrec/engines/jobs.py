@@ -256,7 +256,7 @@ class Run:
             return None
         if not can_any_begin:
             raise Error(f"No worker can start. The last worker {how}")
-        failure = f"Its worker died, on try {task.deaths} of {TRIES}: it {how}"
+        failure = f"Its worker died on try {task.deaths} of {TRIES}: it {how}"
         return JobOutcome(key=task.key, value=None, failure=failure)
 
     def _log(self, lines: Any) -> None:

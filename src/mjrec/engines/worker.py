@@ -58,7 +58,7 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
     except OSError as error:
         how = f"cannot be started: {sys.executable!r}: {error}"
         if not Path(place, WORK).exists():
-            how = f"cannot see {place}: all machines must see it under the same path"
+            how = f"cannot see {place}, which all machines must see under the same path"
         return {"died": how, "begun": False}
     answer = child.do(job)
     if "died" in answer or "error" in answer:

@@ -268,7 +268,7 @@ def _own_context(physics: Any) -> Iterator[Any]:
 
 
 class _PhysicsScene:
-    """The scene as `physics.render()` shows it.
+    """The scene shown by `physics.render()`.
 
     Args:
         env: the environment; its physics may be replaced between calls.

@@ -62,9 +62,8 @@ class Scenes:
             clause that names the overriding class; None if only missing states prevent
             it.
         environment: the facts needed to recreate the environment: `framework`
-            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
-            are unknown, or JSON cannot represent them); None if the environment has no
-            name.
+            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if
+            unknown or not representable in JSON); None if the environment has no name.
         random_state: a function that returns the current state of the environment's
             random generators as JSON-compatible values, or None if there is no
             generator yet. It does not create a generator.

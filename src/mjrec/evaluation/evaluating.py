@@ -361,7 +361,7 @@ def _clear(directory: Path) -> None:
     """Delete only the evaluation in a directory, if there is one.
 
     Raises:
-        DirectoryInUse: a monitor of the evaluation is still open.
+        DirectoryInUse: a monitor in the evaluation is still open.
     """
     if not (directory / PLAN_NAME).exists():
         return

@@ -20,7 +20,7 @@ _SIGNS: Final[dict[str, Callable[[float, float], bool]]] = {
     "<=": operator.le,
 }
 _NO_SCORES: Final = (
-    ", because no task has the same score range in all evaluations: give it with "
+    ", because no task has the same score range in all evaluations: set one with "
     "mjrec evaluate --resume DIR --score-range TASK=LOW:HIGH"
 )
 _FORM: Final = re.compile(

@@ -191,7 +191,7 @@ class EnvironmentMonitor(MonitorBase):
 
     @property
     def stats_recorder(self) -> StatsRecorder:
-        """The recorder of steps and rewards."""
+        """The recorder for steps and rewards."""
         return self._recorder.stats_recorder
 
     @property

@@ -126,7 +126,7 @@ class Tiles:
 
     @property
     def render_mode(self) -> str | None:
-        """`rgb_array` if all sources have it, otherwise None."""
+        """`rgb_array` if all sources have that mode, otherwise None."""
         modes = {source.render_mode for source in self.sources}
         return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
 
@@ -192,7 +192,7 @@ def vector_tiles(
 
 
 class TiledVideo:
-    """A recorder of all sub-environments during the first one's scheduled episodes.
+    """A recorder for all sub-environments during the first one's scheduled episodes.
 
     Args:
         first: the recorder of the first sub-environment, whose manifest lists the

@@ -194,8 +194,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: there was no reset yet, or a sub-environment's episode is over
-                and was not reset.
+            ResetNeeded: there has been no reset yet, or a sub-environment has not been
+                reset since its episode ended.
         """
         if self._is_closed:
             return self.env.step(actions)

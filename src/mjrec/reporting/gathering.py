@@ -288,7 +288,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     elif results.bootstrap != contents.bootstrap:
         how = results.bootstrap
         contents.problems.append(
-            f"The intervals of {directory} were computed differently: {how.resamples} "
+            f"The intervals for {directory} were computed differently: {how.resamples} "
             f"resamples with seed {how.seed}, confidence {how.confidence:g}."
         )
     if results.across is not None and results.across.tasks:

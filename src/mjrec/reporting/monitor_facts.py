@@ -52,7 +52,7 @@ _PACKAGES: Final = {
 }
 _SCHEDULES: Final = {
     "capped_cubic_video_schedule": "episodes 0, 1, 8, 27 ... 729, then every 1000th; "
-    "decided before each began",
+    "decided before each episode began",
     "disable_videos": "none",
 }
 _RULES: Final = {
@@ -175,7 +175,7 @@ def _schedule(details: Mapping[str, Any]) -> str:
     if name.startswith(_KEPT):
         rule = spaced(name.removeprefix(_KEPT))
         return f"{rule}; chosen after all episodes had ended"
-    return _SCHEDULES.get(name, f"chosen by {name} before each began")
+    return _SCHEDULES.get(name, f"chosen by {name} before each episode began")
 
 
 def _joined(*texts: Any) -> str:
@@ -312,7 +312,7 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
         if selection.get("decided") is True:
             yield f"Chosen by {rule}{of} after all episodes had ended."
         else:
-            yield f"Kept by a run that ended before it could choose by {rule}."
+            yield f"Kept because the run ended before {rule} could be applied."
 
 
 def _known(facts: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:

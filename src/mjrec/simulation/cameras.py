@@ -206,7 +206,7 @@ def _unwrapped(holder: object, kind: type) -> Any:
         if isinstance(candidate, kind):
             return candidate
     raise InvalidArgument(
-        f"This must be a mujoco.{kind.__name__} or dm_control's wrapper for one, not "
+        f"This must be a mujoco.{kind.__name__} or a dm_control wrapper for one, not "
         f"{type(holder).__module__}.{type(holder).__qualname__}."
     )
 

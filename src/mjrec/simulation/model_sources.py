@@ -62,7 +62,7 @@ class AuthoredModel:
 
     Attributes:
         main: the name of the MJCF file to compile.
-        files: the content of every file by its name, a relative path with `/`.
+        files: the content of every file, keyed by a relative path with `/`.
     """
 
     main: str

@@ -65,7 +65,7 @@ def note_models(digests: Iterable[str]) -> None:
     If no list can be written, a warning is logged.
 
     Args:
-        digests: the sha256 of the compiled models, in hex.
+        digests: the SHA-256 hashes of the compiled models, in hex.
     """
     wanted = list(dict.fromkeys(digests))
     noting = _noting.get()
@@ -242,4 +242,4 @@ def _check(path: Path, facts: os.stat_result, kind: int, *, mode: int) -> None:
     if stat.S_IFMT(facts.st_mode) != kind or facts.st_uid != os.geteuid():
         raise PermissionError(f"{path} belongs to another user, or is a link or pipe")
     if facts.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise PermissionError(f"{path} is open to others (chmod {mode} {path})")
+        raise PermissionError(f"{path} is open to other users (chmod {mode} {path})")

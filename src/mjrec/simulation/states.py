@@ -127,8 +127,8 @@ def state_columns(
     unknown = sorted(parts.keys() - STATE_BITS.keys())
     if unknown:
         raise InvalidArgument(
-            f"The state contains {', '.join(unknown)}, which is not in "
-            f"MuJoCo {mujoco.__version__}. Use the MuJoCo version that recorded "
+            f"The state contains {', '.join(unknown)}, which MuJoCo "
+            f"{mujoco.__version__} lacks. Use the MuJoCo version that recorded "
             "it, or a later version."
         )
     recorded, here = _lengths(parts), _lengths(own)
