@@ -95,8 +95,8 @@ class Profile:
         shares: share of scores above each threshold, averaged over tasks.
         low: lower ends of the pointwise intervals. Equal to `shares` if there are no
             intervals (`AcrossTasks.interval_method` is None).
-        high: upper ends of the pointwise intervals. Equal to `shares` if there are
-            none.
+        high: upper ends of the pointwise intervals. Equal to `shares` without
+            intervals.
     """
 
     thresholds: tuple[float, ...]
@@ -152,8 +152,7 @@ def summarize_task(
     """Summarize the episodes of one task.
 
     All arrays have one element per completed episode, in the same order. The order
-    affects the figures only by rounding errors. Summarizing a million episodes takes a
-    second.
+    affects the figures only by rounding errors. A million episodes take a second.
 
     Args:
         task: the task's name.

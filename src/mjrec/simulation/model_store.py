@@ -4,8 +4,8 @@
 ::
 
     directory/
-    ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model as is └──
-    openaigym.model.<16 hex digits>.zip       its sources, if known
+    ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model as is
+    └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
 The digits are the beginning of the compiled model's SHA-256. Only the MuJoCo version
 that compiled a model can load it. The zip file is for all other versions, and for all
