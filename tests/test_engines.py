@@ -129,7 +129,7 @@ def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
         found = outcomes(run)
     assert found["once"] == JobOutcome(key="once", value={"alive": True})
     assert found["poison"].failure == (
-        "Its worker died, on try 3 of 3: it was killed by SIGKILL. "
+        "Its worker died on try 3 of 3: it was killed by SIGKILL. "
         "Its last output: SIGKILL is near"
     )
     assert [found[key].failure for key in "abcdef"] == [None] * 6

@@ -59,7 +59,7 @@ def test_an_environment_is_made_with_its_arguments_limit_and_view():
 def test_other_ids_are_refused(env_id):
     """Only ids of known packages are made, and the way out is named."""
     reason = refusal(facts(env_id))
-    assert reason.startswith("it would run code from the archive")
+    assert reason.startswith("this would run code from the archive")
     assert f"--trust {env_id}" in reason
 
 

@@ -43,7 +43,7 @@ from mjrec.rendering.render_videos import name_of_variant
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
-DIED = "Its worker died, on try 3 of 3: it was killed by SIGKILL."
+DIED = "Its worker died on try 3 of 3: it was killed by SIGKILL."
 
 
 class Here(Executor):

@@ -350,7 +350,7 @@ POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
 @pytest.mark.parametrize(
     ("options", "arrays", "said"),
     [
-        ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT of the visual options"),
+        ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT in the visual options"),
         # The first frame is compared, whatever the reason for a difference is.
         ({}, ("geom_xmat",), "drawn from its snapshot differs"),
     ],

@@ -107,7 +107,7 @@ def test_a_recording_without_a_simulation_has_no_model(tmp_path, corridor, play)
     assert trajectory.time is None
     with pytest.raises(UnreadableFile, match="no MuJoCo simulation"):
         trajectory.model()
-    with pytest.raises(InvalidArgument, match=f"Name one of .*: {path.name}\\."):
+    with pytest.raises(InvalidArgument, match=f"Choose one of .*: {path.name}\\."):
         mjrec.load_trajectory(tmp_path)
 
 

@@ -15,8 +15,8 @@ The child sends::
     {"log": ["mjrec.x", 30, "..."]}       a record for the parent's log
     {"limit": [2.0, "FILE", "..."]}       see `worker.time_limit`
 
-The child exits at once, even in the middle of a job, if the pipe from the parent closes
-or if it receives SIGTERM or SIGUSR2.
+The child exits immediately, even in the middle of a job, if the pipe from the parent
+closes or if it receives SIGTERM or SIGUSR2.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
     is_leaving = threading.Lock()
 
     def leave(*_: object) -> None:
-        # Leave only once, although both a signal and the end of the pipe may come. The
+        # Leave only once, even if both a signal and the end of the pipe arrive. The
         # second call waits for the first.
         if is_leaving.acquire(timeout=_SECONDS_TO_LEAVE) and hasattr(handler, "leave"):
             handler.leave()

@@ -18,7 +18,7 @@ ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
 
 
 def given_engine(engine: Executor | str | None, workers: int | None) -> Executor | None:
-    """Return the engine that a caller passed or named, or None if there is none.
+    """Return the engine that a caller passed or named, or None.
 
     Args:
         engine: an executor, or the name of an engine.
@@ -43,7 +43,7 @@ def given_engine(engine: Executor | str | None, workers: int | None) -> Executor
     if workers is not None:
         raise InvalidArgument(
             f"workers={workers} and engine={engine!r} were given, but an engine has "
-            "its own workers: give their number to the engine."
+            "its own workers. Pass their number to the engine."
         )
     return engine
 
@@ -63,9 +63,9 @@ def engine_from(
         name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"` with the address of a
             Dask scheduler.
         workers: maximum number of workers; None uses the engine's default.
-        address: address of a Ray cluster, or `"auto"` for the cluster that runs on this
+        address: address of a Ray cluster, or `"auto"` for the cluster running on this
             machine. If None, the cluster named by `RAY_ADDRESS` is used. If that
-            variable is unset too, Ray is started for the run.
+            variable is also unset, Ray is started for the run.
         gpus: number of GPUs for each worker, which may be a fraction.
         require_gpu: whether a worker that renders in software is an error.
         options: engine-specific options, as strings. Only Slurm has options, which are
@@ -73,7 +73,7 @@ def engine_from(
 
     Raises:
         UnknownName: the engine or an option does not exist.
-        InvalidArgument: an argument is invalid, or belongs to a different engine.
+        InvalidArgument: an argument is invalid, or is for a different engine.
         MissingDependency: a package that the engine needs is not installed.
         Error: the Dask scheduler does not answer.
     """
@@ -93,7 +93,7 @@ def engine_from(
     if options and name != "slurm":
         raise InvalidArgument(
             f"The engine {name} has no options of its own, but these were given: "
-            f"{', '.join(sorted(options))}. Slurm's options need --engine slurm."
+            f"{', '.join(sorted(options))}. Slurm's options require --engine slurm."
         )
     if name == "ray":
         return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
@@ -113,7 +113,7 @@ def _dask(address: str) -> Executor:
             f"No Dask scheduler answers at {address}. `dask scheduler` starts one and "
             f"prints its address. Dask's error: {error}"
         ) from error
-    # Do not merge jobs that look alike, because every job must run.
+    # Do not merge identical jobs, because every job must run.
     executor: Executor = client.get_executor(pure=False)
     weakref.finalize(executor, client.close)
     return executor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The number of workers, the GPUs that each worker gets, and engines' packages."""
+"""The number of workers, the GPUs for each worker, and the engines' packages."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class GpuShare:
     Attributes:
         each: number of GPUs per worker, which may be a fraction: with 0.25, four
             workers share a GPU. 0 means no GPU.
-        required: whether a worker that renders in software anyway is an error, not only
-            a warning.
+        required: whether a worker that renders in software is an error instead of a
+            warning.
 
     Raises:
         InvalidArgument: `each` is not a number, is negative, or is more than 1 and not
@@ -44,7 +44,7 @@ class GpuShare:
             )
         if self.required and not self.each:
             raise InvalidArgument(
-                "A GPU is required (require_gpu, --require-gpu): give each worker a "
+                "A GPU is required (require_gpu, --require-gpu). Give each worker a "
                 "share of a GPU, such as gpus=0.25 (--gpus 0.25)."
             )
 
@@ -61,7 +61,7 @@ class GpuShare:
     def of(self, seat: int, gpus: Sequence[str]) -> str | None:
         """Return the GPUs for a worker, in the format of `CUDA_VISIBLE_DEVICES`.
 
-        If there are more workers than shares, the assignment starts over with the first
+        If there are more workers than shares, the assignment wraps around to the first
         GPU.
 
         Args:
@@ -81,7 +81,7 @@ class GpuShare:
 
 
 def check_worker_count(count: int | None, name: str = "workers") -> int | None:
-    """Check a number of workers: a whole number of at least 1, or None.
+    """Check that a number of workers is a whole number of at least 1, or None.
 
     Args:
         count: the number.
@@ -102,7 +102,7 @@ def check_worker_count(count: int | None, name: str = "workers") -> int | None:
 
 
 def engine_package(package: str, engine: str, *, install: str) -> Any:
-    """Import the package that an engine needs, which is slow and optional.
+    """Import an engine's package, which is optional and slow to import.
 
     Raises:
         MissingDependency: the package is not installed.

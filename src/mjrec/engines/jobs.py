@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs that are submitted to an executor and followed until they are done.
+"""Jobs that are submitted to an executor and monitored until they are done.
 
 An engine is a `concurrent.futures.Executor`: one of ours (`LocalEngine`, `RayEngine`,
-`SlurmEngine`) or any other whose workers see the same directory. The executor calls
-`worker.do_job` with plain data. That function does the job in a child process of the
-worker, so a crash affects only one job, and the executor does not notice it.
+`SlurmEngine`) or any other executor whose workers see the same directory. The executor
+calls `worker.do_job` with plain data. That function does the job in a child process of
+the worker, so a crash affects only one job, not the executor.
 
-Doing a job twice is harmless, so if the child dies, the job is submitted again.
+Doing a job twice is harmless, so if the child dies, the job is resubmitted.
 """
 
 from __future__ import annotations
@@ -41,27 +41,28 @@ TRIES = 3
 _OF_MUJOCO = "simulation.warnings"
 _NUMBERS = re.compile(r"[\d.]+")
 
-# Not from `tempfile`, which imports `random`: a user's script may have that name.
+# Not from `tempfile`, because it imports `random`, and a user's script may have that
+# name.
 _TEMPORARY = Path(os.environ.get("TMPDIR") or "/tmp")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """The work of a run's children.
+    """The work for a run's children.
 
     Attributes:
         entry: `module:name` of a function that creates a handler. It is called once in
             each child, with the settings. The handler is called with the arguments of
-            one job after another, and returns a small JSON object. If the handler has a
-            method `leave`, it is called on another thread when the child has to exit
+            each job in turn, and returns a small JSON object. If the handler has a
+            `leave` method, it is called on another thread when the child has to exit
             for reasons other than its own failure.
         settings: settings for all jobs, as JSON.
-        environ: environment variables for the children, in addition to their worker's.
+        environ: environment variables for the children, in addition to the worker's.
         shared_directory: a directory that all workers see under this path; a folder in
-            it is used during the run. It may be None if all processes are on this
+            it is used during the run. None is allowed if all processes are on this
             machine.
-        payload: bytes for all children. They are written to a file, and the settings
-            get its path as `payload`.
+        payload: bytes for all children. They are written to a file, whose path is added
+            to the settings as `payload`.
     """
 
     entry: str
@@ -94,7 +95,7 @@ class _Task:
 
 
 class Run:
-    """The jobs of a `Work` on an executor.
+    """A run of a `Work` on an executor.
 
     Leaving the `with` block cancels unfinished jobs.
 
@@ -122,7 +123,7 @@ class Run:
             settings["payload"] = str(self._place / "payload")
             (self._place / "payload").write_bytes(work.payload)
         share = getattr(engine, "share", None)
-        # The file stays locked while this process lives.
+        # The file stays locked while this process is running.
         self._file = (self._place / WORK).open("w")
         fcntl.flock(self._file, fcntl.LOCK_EX)
         json.dump(
@@ -131,7 +132,7 @@ class Run:
                 "settings": settings,
                 "environ": dict(work.environ),
                 "require_gpu": share.required if share and share.asked_for else None,
-                # So that a policy's modules are found as in the driver.
+                # This ensures that a policy's modules are found as in the driver.
                 "directory": str(Path.cwd()),
                 "path": [str(Path(entry).absolute()) for entry in sys.path],
             },
@@ -144,10 +145,10 @@ class Run:
         self._told: set[tuple[str, int, str]] = set()
 
     def submit(self, key: str, **arguments: Any) -> None:
-        """Add a job, which is possible even while results arrive.
+        """Add a job. Jobs may also be added while results arrive.
 
         Args:
-            key: a key that is unique in the run.
+            key: a key that is unique within the run.
             **arguments: the handler's arguments, as JSON.
         """
         self._hand_out(_Task(key, arguments))
@@ -155,12 +156,12 @@ class Run:
     def results(self, *, timeout_s: float | None = None) -> Iterator[JobOutcome | None]:
         """Yield outcomes as they arrive, until no jobs are left.
 
-        If a job's child dies, the job is retried after the others, up to `TRIES` times
-        in total.
+        If a job's child dies, the job is retried after the other jobs. A job is tried
+        up to `TRIES` times.
 
         Args:
             timeout_s: yield None whenever no outcome has arrived for this many seconds;
-                never if `timeout_s` is None.
+                None means no timeout.
 
         Raises:
             Error: no child can start, or the handler cannot be created.
@@ -183,13 +184,13 @@ class Run:
 
     def cancel(self) -> None:
         """End all jobs. Idempotent."""
-        # Children, and the threads that wait for them, watch this file.
+        # Children, and the threads that wait for them, check for this file.
         (self._place / WORK).unlink(missing_ok=True)
         running = {future for future in self._tasks if not future.cancel()}
         self._tasks.clear()
         self._parked.clear()
         try:
-            # For Slurm, whose jobs outlive their futures.
+            # This is for Slurm, whose jobs outlive their futures.
             if end_run := getattr(self._engine, "end_run", None):
                 end_run(str(self._place))
             wait(running)
@@ -221,11 +222,11 @@ class Run:
         try:
             answer = future.result()
         except CancelledError:
-            answer = {"died": "was cancelled by its executor", "begun": True}
+            answer = {"died": "was canceled by its executor", "begun": True}
         except Error:
             raise
         except Exception as error:
-            # This is the executor's own error: it has lost one of its workers.
+            # This error is from the executor itself, which has lost one of its workers.
             why = f"{type(error).__name__}: {error}".splitlines()
             how = f"is gone: {why[0]} {why[-1] if why[1:] else ''}"
             answer = {"died": how, "begun": True}
@@ -240,8 +241,7 @@ class Run:
     def _bury(self, task: _Task, how: str, *, has_begun: bool) -> JobOutcome | None:
         can_any_begin = (self._place / BEGUN).exists()
         if not has_begun and can_any_begin and self._tasks:
-            # The child never reached the job, so the job waits for a worker that can do
-            # jobs.
+            # The child never started the job, so the job waits for a working worker.
             logger.warning("A worker could not start. It %s", how)
             self._parked.append(task)
             return None
@@ -256,13 +256,13 @@ class Run:
             return None
         if not can_any_begin:
             raise Error(f"No worker can start. The last worker {how}")
-        failure = f"Its worker died, on try {task.deaths} of {TRIES}: it {how}"
+        failure = f"Its worker died on try {task.deaths} of {TRIES}: it {how}"
         return JobOutcome(key=task.key, value=None, failure=failure)
 
     def _log(self, lines: Any) -> None:
         """Log the children's log records in this process, each message once per run."""
         for name, level, text in lines:
-            # MuJoCo's warnings differ in times and joint numbers; log each kind only
+            # MuJoCo's warnings vary in times and joint numbers; log each kind only
             # once.
             kind = _NUMBERS.sub("", text) if name.endswith(_OF_MUJOCO) else text
             if (name, level, kind) not in self._told:
@@ -279,7 +279,7 @@ def _new_place(shared: Path | None) -> Path:
         else:
             place = shared.absolute() / WORK_FOLDER / name
             _end_earlier_runs(place.parent)
-        # The folder decides what code runs, so only its owner may write to it.
+        # The folder determines what code runs, so only its owner may write to it.
         place.mkdir(mode=0o700, parents=True)
     except OSError as error:
         raise DirectoryNotWritable(shared or _TEMPORARY, error.strerror) from error
@@ -287,10 +287,10 @@ def _new_place(shared: Path | None) -> Path:
 
 
 def _end_earlier_runs(folder: Path) -> None:
-    """Remove the folders of killed drivers, which ends the children of their runs."""
+    """Remove the folders left by killed drivers, which ends those runs' children."""
     for path in folder.glob(f"*/{WORK}"):
         with contextlib.suppress(OSError), path.open("rb") as file:
-            # This raises an error if the driver is alive.
+            # This raises an error if the driver is running.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             logger.info("The run in %s has no driver, so it was stopped.", path.parent)
             path.unlink()

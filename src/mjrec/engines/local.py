@@ -19,15 +19,15 @@ from .gpu_shares import GpuShare, check_worker_count
 
 
 class LocalEngine(Executor):
-    """An engine that runs jobs on this machine, with a thread and a child per worker.
+    """An engine that runs jobs on this machine, with one thread and child per worker.
 
     Args:
         workers: maximum number of workers. None means one per usable CPU.
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
             workers share a GPU. Workers share the GPUs in `CUDA_VISIBLE_DEVICES`, or
-            all of the machine's GPUs if it is not set.
+            all of the machine's GPUs if that variable is not set.
         require_gpu: whether a worker that was given a GPU but renders in software is an
-            error, not only a warning.
+            error instead of a warning.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
@@ -65,8 +65,8 @@ class LocalEngine(Executor):
         future: Future[Any] = Future()
         self._calls.put((future, functools.partial(fn, *args, **kwargs)))
         if self._threads < self.workers:
-            # Daemons, so that they do not delay interpreter exit. They refer only to
-            # the queue, so they do not keep the engine alive.
+            # Daemon threads, so that they do not delay interpreter exit. They refer
+            # only to the queue, so they do not keep the engine alive.
             threading.Thread(
                 target=_work,
                 args=[self._calls, self.share, self._threads],
@@ -97,5 +97,5 @@ def _work(calls: queue.SimpleQueue[_Call | None], share: GpuShare, number: int) 
                 future.set_exception(error)
         # Do not keep references to this call while waiting for the next one.
         del call, future, do
-    # Pass the end on to the other threads.
+    # Pass the end marker on to the other threads.
     calls.put(None)

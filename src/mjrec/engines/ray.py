@@ -31,7 +31,7 @@ from .gpu_shares import GpuShare, check_worker_count, engine_package
 
 logger = logging.getLogger(__name__)
 
-# Ray's minimum is 75 MiB; jobs and their outcomes need hardly any memory.
+# Ray's minimum is 75 MiB; jobs and their outcomes need very little memory.
 _SMALLEST_STORE = 80 << 20
 _SECONDS_TO_REACH = 10.0
 
@@ -40,16 +40,16 @@ class RayEngine(Executor):
     """An engine that runs jobs on a Ray cluster.
 
     Args:
-        workers: maximum number of workers at once. None means as many as the cluster
-            has room for, even as it grows.
-        address: address of the cluster. None means `RAY_ADDRESS`. If that is not set
-            either, Ray is started on this machine, without usage statistics or a
+        workers: maximum number of simultaneous workers. None means as many as the
+            cluster has room for, even as it grows.
+        address: address of the cluster. None means `RAY_ADDRESS`. If that is also
+            unset, Ray is started on this machine, without usage statistics or a
             dashboard, and stopped together with the engine. If this process is already
             connected to Ray, that connection is used and left open.
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
             workers share a GPU.
         require_gpu: whether a worker that was given a GPU but renders in software is an
-            error, not only a warning.
+            error instead of a warning.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
@@ -121,7 +121,7 @@ class RayEngine(Executor):
                 logger.warning("%s Workers render in software.", lack)
                 self.share = GpuShare()
         self._task = self._ray.remote(
-            # The run itself reports and resubmits lost tasks.
+            # The `Run` itself reports and resubmits lost tasks.
             num_cpus=1,
             num_gpus=self.share.each,
             max_retries=0,
@@ -159,7 +159,7 @@ def _call(
     if version != mjrec.__version__:
         raise Error(
             f"The driver has mjrec {version}, but a Ray worker has "
-            f"{mjrec.__version__}: install the same version on all machines."
+            f"{mjrec.__version__}. Install the same version on all machines."
         )
     return fn(*args, **kwargs)
 
@@ -167,8 +167,8 @@ def _call(
 def _disconnect(ray: Any) -> None:
     with contextlib.suppress(Exception):
         ray.shutdown()
-    # If this process starts Ray again, it must not reuse our token. The cache is a
-    # private API, which older versions lack.
+    # If this process restarts Ray, it must not reuse our token. The cache is a private
+    # API, which older versions lack.
     with contextlib.suppress(ImportError, AttributeError):
         raylet = importlib.import_module("ray._raylet")
         raylet.AuthenticationTokenLoader.instance().reset_cache()
@@ -207,7 +207,7 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise OSError if no cluster is listening; Ray itself would try for minutes."""
+    """Raise OSError if no cluster is listening. Ray itself would retry for minutes."""
     if address == "auto":
         # This private API returns Ray's record of a cluster, which may have stopped.
         with contextlib.suppress(ImportError, AttributeError):
@@ -223,7 +223,7 @@ def _start(ray: Any, cpus: int) -> None:
         "RAY_USAGE_STATS_ENABLED": "0",
         # Workers without a GPU see the same GPUs as without Ray.
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-        # Children of jobs exit on their own, after sending their last message.
+        # The children exit on their own after sending their last message.
         "RAY_kill_child_processes_on_worker_exit": "0",
     }
     is_token_known = (
@@ -231,7 +231,7 @@ def _start(ray: Any, cpus: int) -> None:
         & {*filter(os.environ.get, os.environ)}
     ) or (Path.home() / ".ray" / "auth_token").exists()
     if not is_token_known:
-        # Otherwise Ray would write a token into the home directory, and leave it there.
+        # Otherwise Ray would write a token to the home directory and leave it there.
         environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     with changed_environ(environ):
         ray.init(
@@ -245,7 +245,7 @@ def _start(ray: Any, cpus: int) -> None:
 
 @contextlib.contextmanager
 def _signals_as_they_are() -> Iterator[None]:
-    """Restore signal handlers after the block, which only the main thread can do."""
+    """Restore signal handlers after the block. Only the main thread can do so."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each for some of a run's jobs.
+"""An engine for Slurm: arrays of Slurm jobs, each of which does some jobs of a run.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
-on the life of a single Slurm job. A Slurm job that is requeued does only the jobs that
-it has not done yet, and jobs that an array did not finish are submitted again. The
-files in that folder are::
+on the survival of a single Slurm job. A Slurm job that is requeued does only its
+remaining jobs, and jobs that an array did not finish are resubmitted. The files in that
+folder are::
 
     slurm/outcomes/17.json   the return value of `worker.do_job` for job 17
     slurm/logs/              output of the Slurm jobs, and submitit's own files
@@ -44,7 +44,7 @@ from .worker import do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
-# The number of jobs that a cluster would run at once is unknown; four is always
+# The number of jobs that a cluster would run in parallel is unknown; four is always
 # acceptable.
 DEFAULT_WORKERS = 4
 
@@ -68,7 +68,7 @@ _NOT_OVER = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A job of a run, with its future."""
+    """A job in a run, with its future."""
 
     number: int
     place: Path
@@ -77,7 +77,7 @@ class _Task:
 
 
 class SlurmEngine(Executor):
-    """An engine that runs jobs in Slurm jobs.
+    """An engine that runs jobs inside Slurm jobs.
 
     Args:
         workers: maximum total number of workers in all Slurm jobs. None means 4, or one
@@ -87,21 +87,21 @@ class SlurmEngine(Executor):
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
             workers share a GPU.
         require_gpu: whether a worker that was given a GPU but renders in software is an
-            error, not only a warning.
+            error instead of a warning.
         cpus_per_worker: number of CPUs per worker.
         workers_per_job: number of workers in one Slurm job, on one machine. None means
-            as many as share a GPU, or one if they do not share.
+            as many as share a GPU, or one without sharing.
         partition: partition for the Slurm jobs. Here and below, None means the
             cluster's default.
-        account: account to charge for the jobs.
+        account: account charged for the jobs.
         qos: quality of service.
         constraint: features that nodes must have.
         time_min: time limit for a Slurm job, in minutes. A Slurm job that reaches the
-            limit is requeued and continues. The longest single job must fit into it.
-        notice_s: number of seconds before the time limit at which a Slurm job stops.
-            None means 120, or a quarter of the limit if that is shorter.
+            limit is requeued and continues. The limit must exceed the longest job.
+        notice_s: how many seconds before the time limit a Slurm job stops. None means
+            120, or a quarter of the limit if that is shorter.
         mem_gb: memory per worker, in gigabytes.
-        setup: shell lines that run first in a Slurm job.
+        setup: shell commands that run first in a Slurm job, one per line.
         sbatch: other options for `sbatch`, by name, without dashes.
 
     Raises:
@@ -151,7 +151,7 @@ class SlurmEngine(Executor):
         names_gpus = any(name.startswith(("gpu", "gres")) for name in others)
         self._per_job = per_job
         self._most_jobs = math.ceil(self.workers / per_job)
-        # Named GPUs are among the other options.
+        # Named GPUs are requested by the other options.
         needed_gpus = 0 if names_gpus else math.ceil(gpus * per_job - 1e-9)
         self._parameters = {
             "name": "mjrec",
@@ -173,7 +173,7 @@ class SlurmEngine(Executor):
         }
         self._numbers = itertools.count()
         self._waiting: list[_Task] = []
-        # The tasks, by the submitit job that does them.
+        # The tasks, keyed by the submitit job that does them.
         self._elements: dict[Any, list[_Task]] = {}
         self._last_added = self._last_asked = -math.inf
         self._last_progress = 0.0
@@ -348,7 +348,7 @@ class SlurmEngine(Executor):
         return states
 
 
-# Set in a Slurm job that is about to be requeued.
+# Set when this Slurm job is about to be requeued.
 _is_ending = threading.Event()
 
 
@@ -358,7 +358,7 @@ class ArrayElement:
 
     Attributes:
         place: the folder `slurm` in the run's folder.
-        workers: number of workers that do jobs at once.
+        workers: number of workers that do jobs in parallel.
         share: each worker's share of the Slurm job's GPUs.
     """
 
@@ -367,12 +367,12 @@ class ArrayElement:
     share: GpuShare
 
     def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
-        """Do the jobs that have no outcome yet.
+        """Do the jobs that do not have an outcome yet.
 
         Args:
-            jobs: the jobs, by number.
+            jobs: the jobs, keyed by number.
         """
-        # submitit does not handle SIGTERM. Children end with this process.
+        # submitit does not handle SIGTERM. Children exit with this process.
         signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
         run = str(self.place.parent)
 
@@ -381,8 +381,8 @@ class ArrayElement:
             if path.exists() or _is_ending.is_set():
                 return
             answer = do_job(run, jobs[number])
-            # If the child died because this Slurm job is ending, the job is not to
-            # blame.
+            # If the child died because this Slurm job is ending, the job has not
+            # failed.
             if "died" not in answer or not _is_ending.wait(_SECONDS_BETWEEN_LOOKS):
                 with contextlib.suppress(Error):
                     write_text(path, json.dumps(answer))
@@ -436,7 +436,7 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
     return {**options, "sbatch": sbatch}
 
 
-# Parameters for which the command line has separate options.
+# Parameters that have separate command-line options.
 _ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
 
 
@@ -476,7 +476,7 @@ def _submitit(cluster: str) -> Any:
 
 
 def _as_from_outside() -> contextlib.AbstractContextManager[None]:
-    """Hide any surrounding Slurm job from commands inside the block.
+    """Hide the enclosing Slurm job, if any, from commands inside the block.
 
     Otherwise that job's resources (its CPUs and memory) would be mistaken for the
     requested ones.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The function that executors call to do a job in a child process.
 
-A child stays for later jobs of its run, so that a policy is loaded only once per child.
-The child is terminated when its run is over. Every machine can see this, because the
-file `work.json` in the run's folder is then removed. The child also ends if the process
-that started it ends.
+A child is kept for later jobs in its run, so that a policy is loaded only once per
+child. The child is terminated when its run is over. Every machine can detect this,
+because the file `work.json` in the run's folder is then removed. The child also ends if
+the process that started it ends.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ parent: Parent | None = None
 
 
 def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
-    """Do a job in a child process, and return its outcome as plain data.
+    """Do a job in a child process, and return the outcome as plain data.
 
     Args:
         place: the run's folder.
@@ -46,8 +46,8 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
 
     Returns:
         `value` or `failure` if the job is over; `died` and `begun` (whether the child
-        had begun) if the child died; `error` if the handler could not be created. `log`
-        contains the child's log records at warning level and above.
+        had started) if the child died; `error` if the handler could not be created.
+        `log` contains the child's log records at warning level and above.
     """
     kind = place, getattr(seat, "gpus", None)
     with _one_at_a_time:
@@ -58,7 +58,7 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
     except OSError as error:
         how = f"cannot be started: {sys.executable!r}: {error}"
         if not Path(place, WORK).exists():
-            how = f"cannot see {place}: all machines must see it under the same path"
+            how = f"cannot see {place}, which all machines must see under the same path"
         return {"died": how, "begun": False}
     answer = child.do(job)
     if "died" in answer or "error" in answer:
@@ -82,7 +82,7 @@ def end_idle_children(place: str) -> None:
 def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
     """Kill this child if the block takes longer than a limit.
 
-    The parent process does the killing, because code that hangs may block the
+    The parent process kills the child, because code that hangs may block the
     interpreter.
 
     Args:
@@ -101,17 +101,17 @@ def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
 
 
 class _JobChild(Child):
-    """A process that does the jobs of one run; see the module `child` for the messages.
+    """A process that does one run's jobs; see the module `child` for the messages.
 
     Its output is copied to standard error, line by line.
 
     Args:
         place: the run's folder.
-        gpus: the GPUs that the child renders on, in the format of
+        gpus: the GPUs on which the child renders, in the format of
             `CUDA_VISIBLE_DEVICES`; None means this process's own setting.
 
     Raises:
-        OSError: the process cannot be started, or the run does not exist.
+        OSError: the process cannot be started, or the run no longer exists.
     """
 
     def __init__(self, place: str, gpus: str | None) -> None:
@@ -152,7 +152,7 @@ class _JobChild(Child):
                 if limit and time.monotonic() > ends_at:
                     self.kill()
                 if not self._work.exists():
-                    how = "was cancelled"
+                    how = "was canceled"
                     break
             elif "log" in message:
                 log.append(message["log"])
@@ -176,7 +176,7 @@ class _JobChild(Child):
     def end(self) -> None:
         """End the child and the processes that it started. Idempotent."""
         super().end()
-        # Processes that the child left behind may keep the pipe open.
+        # Processes left behind by the child may keep the pipe open.
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
 
     def _pass_on(self, words: int) -> None:

@@ -22,9 +22,9 @@ _ENDLESS = 1e10
 
 
 def action_space(environment: Any) -> Space[Any]:
-    """Return the space of an environment's actions, for sampling.
+    """Return an environment's action space, for sampling.
 
-    The space is a copy, so sampling from it does not affect the environment's own.
+    The space is a copy, so sampling does not affect the environment's own space.
 
     Args:
         environment: a Gymnasium or dm_env environment. A list of specs becomes a
@@ -43,7 +43,7 @@ def sampler(space: Space[Any]) -> Callable[[], Any]:
     """Return a function that samples the same actions as `space.sample`, but faster.
 
     `Box.sample` takes half as long as a step of HalfCheetah, because it sorts the
-    bounds again each time. If all bounds are finite, a tenth of the time is enough.
+    bounds each time. If all bounds are finite, this function takes a tenth of the time.
     """
     if type(space) is not spaces.Box or not (space.shape and space.is_bounded()):
         return space.sample
@@ -64,7 +64,7 @@ def sampler(space: Space[Any]) -> Callable[[], Any]:
 
 
 def zero(space: Space[Any]) -> Any:
-    """Return the action closest to zero.
+    """Return the valid action closest to zero.
 
     Raises:
         PolicyError: zero is not defined for the space.
@@ -87,7 +87,7 @@ def zero(space: Space[Any]) -> Any:
 
 
 def checked(space: Space[Any], action: Any) -> Any:
-    """Return an action in the form that the environment takes.
+    """Return an action in the form that the environment expects.
 
     Values for a `Box` may have any numeric type and exceed its bounds, because
     environments clip them, but they must be finite and have the shape of the `Box`.
@@ -99,7 +99,7 @@ def checked(space: Space[Any], action: Any) -> Any:
     """
     try:
         return _taken(space, action)
-    # Some spaces raise arbitrary errors for values unlike their members.
+    # Some spaces raise arbitrary errors for values of the wrong kind.
     except Exception:
         raise PolicyError(
             f"The policy must return an action in {space}, not {action!r}."

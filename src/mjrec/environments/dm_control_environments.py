@@ -28,9 +28,9 @@ _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
-    """Create a task of the suite.
+    """Create a task from the suite.
 
-    The camera and the size belong to each frame, not to the environment. Episodes end
+    The camera and the size apply to each frame, not to the environment. Episodes end
     after `max_steps`, or after 1000 steps if the task has no time limit.
 
     Args:
@@ -57,11 +57,11 @@ def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
             hint="A dm_control environment's name is dm_control/<domain>-<task>.",
         )
     if task not in tasks:
-        raise UnknownName(f"task of dm_control's {domain}", task, tasks)
+        raise UnknownName(f"dm_control {domain} task", task, tasks)
     for name in options.kwargs:
         if name not in _ARGUMENTS:
             raise UnknownName(
-                "argument of a dm_control environment",
+                "dm_control environment argument",
                 name,
                 _ARGUMENTS,
                 hint='For example {"task_kwargs": {"time_limit": 5}}.',
@@ -83,17 +83,17 @@ def load_task(
 
     Args:
         env_id: `dm_control/<domain>-<task>`.
-        kwargs: arguments for `suite.load`; None if a recording does not have them. In
-            that case, recordings of the returned environment do not have them either.
+        kwargs: arguments for `suite.load`; None if a recording lacks them. In that
+            case, recordings of the returned environment also lack them.
         limit: number of steps after which an episode ends as truncated, unless the task
             ends it earlier.
     """
     environment = suite.load(*task_of_suite(env_id), **(kwargs or {}))
     if kwargs is not None:
-        # An environment does not keep the arguments that it was created with.
+        # An environment does not store the arguments used to create it.
         setattr(environment.task, MADE_WITH, kwargs)
     if limit is not None:
-        # There is no public way to read or set a task's limit in steps.
+        # There is no public way to read or set a task's step limit.
         environment._step_limit = min(limit, environment._step_limit)
     return environment
 
@@ -106,8 +106,7 @@ class DmControlEnvironment(NamedEnvironment):
         options: the options; the camera and size are passed to the monitor.
 
     Raises:
-        Error: see `make_dm_control`. This is also raised if the model has no such
-            camera.
+        Error: see `make_dm_control`; also raised if the model has no such camera.
     """
 
     def __init__(self, env_id: str, options: EnvironmentOptions) -> None:
@@ -131,11 +130,12 @@ class DmControlEnvironment(NamedEnvironment):
 
         dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
         from one `RandomState`. It is seeded in place, because other objects share it. A
-        monitor gets the seed for its metadata.
+        monitor receives the seed for its metadata.
 
         If the environment was created with this seed and never reset, it is used
         exactly as `suite.load(..., task_kwargs={"random": seed})` created it. The
-        random choices made at that time are kept, and no seed is set for this episode.
+        random choices made during creation are kept, and no seed is set for this
+        episode.
         """
         if not self._was_reset and seed == self._made_with:
             seed = None

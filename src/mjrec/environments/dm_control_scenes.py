@@ -38,12 +38,12 @@ _UPLOADS = ("mjr_uploadHField", "mjr_uploadTexture", "mjr_uploadMesh")
 
 
 class ContextsOnDemand:
-    """A guard against contexts that resets would create only to upload to them.
+    """A guard that prevents resets from creating contexts only for terrain uploads.
 
     Some tasks (quadruped-escape, the rodent's bowl) create a new terrain in each reset
     and upload it to the rendering context. Even checking for a context creates one. If
-    there is no context, the upload can be skipped, because a context that is created
-    later starts with the current terrain.
+    there is none, the upload can be skipped, because a context that is created later
+    starts with the current terrain.
 
     Args:
         env: an environment with dm_control's `physics`, which each reset may replace.
@@ -59,12 +59,12 @@ class ContextsOnDemand:
     def resetting(self) -> Iterator[None]:
         """Return a context manager for resetting the environment.
 
-        Inside the block, a physics that has no contexts gets a stand-in for them, which
-        creates real contexts as soon as anything is drawn. After the block, even if it
-        raised an error, the physics is as it was before.
+        Inside the block, a physics without contexts gets a stand-in, which creates real
+        contexts as soon as anything is drawn. After the block, the physics is restored,
+        even if an error was raised.
         """
         self._is_resetting = True
-        # If the reset compiles a new physics, this hook gets it in time.
+        # If the reset compiles a new physics, this hook receives it in time.
         if not self._hooked and hasattr(self._env, "add_extra_hook"):
             # Composer cannot remove a hook, but this hook does nothing outside resets.
             self._env.add_extra_hook("after_compile", self._stand_in)
@@ -75,7 +75,7 @@ class ContextsOnDemand:
         finally:
             self._is_resetting = False
             while self._replaced:
-                # Composer's physics are weak references, which may have expired.
+                # Composer's physics is a weak reference, which may have expired.
                 with contextlib.suppress(ReferenceError):
                     self._replaced.pop().take_out()
 
@@ -87,7 +87,7 @@ class ContextsOnDemand:
 
 
 class _Contexts:
-    """A stand-in for a physics's contexts, until something is drawn in them."""
+    """A stand-in for the contexts of a physics, until something is drawn in them."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics
@@ -118,10 +118,10 @@ class _Contexts:
 
 
 _SUITE = "dm_control/"
-# The attribute in which a suite task created here keeps `suite.load`'s other arguments.
+# The attribute of a suite task that stores the other arguments of `suite.load`.
 MADE_WITH = "_mjrec_made_with"
 
-# Read at every captured step. It is dm_control's object, which belongs to one model.
+# Read at every captured step. The result is dm_control's object for one model.
 _DATA = attrgetter("physics.data")
 
 # The limit for frames that `physics.render()` does not draw.
@@ -129,7 +129,7 @@ _MAX_GEOM = 10000
 
 
 _NOT_BY_PHYSICS = (
-    "physics.render() cannot draw from an MjvCamera, nor draw frames larger than the "
+    "physics.render() cannot use an MjvCamera or draw frames larger than the "
     "model's offscreen buffer; such frames are drawn from recorded states, never live. "
     "Leave out render="
 )
@@ -148,10 +148,10 @@ def dm_control_scenes(
     width: int | None = None,
     env_id: str | None = None,
 ) -> Scenes:
-    """Return how the states of a dm_control environment are recorded.
+    """Return how to record the states of a dm_control environment.
 
-    The frames are those of `physics.render()`. It cannot draw frames that are larger
-    than the model's offscreen buffer or come from an `MjvCamera`: those are rendered
+    The frames are those of `physics.render()`. Frames that it cannot draw, because they
+    are larger than the model's offscreen buffer or use an `MjvCamera`, are rendered
     separately from the same scene, never live.
 
     Args:
@@ -200,7 +200,7 @@ def dm_control_scenes(
 
 def generator_of(env: Any) -> Any:
     """Return an environment's random number generator, or None."""
-    # The suite's tasks use the first place, and composer's environments the second.
+    # The suite's tasks use the first attribute, and composer's environments the second.
     for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
         found = getattr(holder, name, None)
         if isinstance(found, np.random.RandomState):
@@ -251,7 +251,7 @@ class PhysicsFrames:
 def _own_context(physics: Any) -> Iterator[Any]:
     """Make the context that dm_control draws with current, and yield its executor.
 
-    dm_control remembers which context it made current last. If another library has
+    dm_control remembers which context it last made current. If another library has
     since changed the current context, dm_control would draw without one. Its context
     must not stay current either: when a `mujoco.Renderer` is closed or collected, it
     frees those objects in the current context that have the same numbers as its own. In
@@ -262,13 +262,13 @@ def _own_context(physics: Any) -> Iterator[Any]:
         with gl.make_current() as context:
             context.call(gl._platform_make_current)
             yield context
-        # dm_control makes it current again when it draws next.
+        # dm_control makes its context current again when it next draws.
         base._CURRENT_THREAD_FOR_CONTEXT.pop(id(gl), None)
         base._CURRENT_CONTEXT_FOR_THREAD.pop(gl.thread, None)
 
 
 class _PhysicsScene:
-    """The scene as `physics.render()` shows it.
+    """The scene shown by `physics.render()`.
 
     Args:
         env: the environment; its physics may be replaced between calls.
@@ -285,7 +285,7 @@ class _PhysicsScene:
         self._size = size
         self._by_physics = by_physics
         self._option = option_without_rangefinder()
-        # The data when the view was last requested.
+        # The data from when the view was last requested.
         self._data: Any = None
         # Whether the camera has been placed since then.
         self._is_placed = False
@@ -303,13 +303,13 @@ class _PhysicsScene:
     def at_frame(self, capture: Callable[[], None]) -> None:
         """Call `capture` with the view of the current frame."""
         if self._camera == FREE_CAMERA:
-            # The free camera moves with the model's fields.
+            # The free camera's pose depends on the model's fields.
             place_free_camera(self._model, self._view.camera)
         self._is_placed = True
         capture()
 
     def is_unmoved(self) -> bool:
-        """Check quickly whether the view is certainly the same as for the last frame.
+        """Check quickly whether the view is known to be unchanged since the last frame.
 
         Changes to the model, the camera and the option are not checked for. The result
         is True if the simulation is the same as when the view was last requested.
@@ -322,7 +322,7 @@ class _PhysicsScene:
         self._view = SceneView(
             camera=resolve_camera(self._model, self._camera),
             option=self._option,
-            # Only dm_control's scenes show which number it chose.
+            # Only a dm_control scene reveals the number of geoms that dm_control chose.
             max_geom=wrapper.MjvScene(model).maxgeom if self._by_physics else _MAX_GEOM,
             # Each `physics.render()` creates a new scene.
             fresh=self._by_physics,
@@ -340,7 +340,7 @@ def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> boo
 
 
 def _authored(env: Any) -> AuthoredModel | None:
-    """Return the MJCF that composer or the suite compiled, or None."""
+    """Return the MJCF compiled by composer or the suite, or None if unknown."""
     task = getattr(env, "task", None)
     root = getattr(task, "root_entity", None)
     if root is None:
@@ -351,10 +351,10 @@ def _authored(env: Any) -> AuthoredModel | None:
 
 
 def _authored_of_suite(task: Any) -> AuthoredModel | None:
-    """Return the sources of a domain's models, from the task's module, or None.
+    """Return a domain's model sources from the task's module, or None.
 
     A task does not keep its model's sources, and may have changed them before
-    compiling. Storing the sources compiles them and checks that they give this model.
+    compiling. Storing the sources checks that they compile to this model.
     """
     name = type(task).__module__
     domain = sys.modules.get(name) if name.startswith("dm_control.suite.") else None
@@ -362,7 +362,7 @@ def _authored_of_suite(task: Any) -> AuthoredModel | None:
     try:
         text, assets = sources()  # type: ignore[misc]  # None raises TypeError, too
     except TypeError:
-        # Some domains, such as stacks, have a different model for each number.
+        # Some domains, such as stacker, have a model for each number of objects.
         return None
     files = {"model.xml": text, **assets}
     return AuthoredModel("model.xml", {k: _bytes(v) for k, v in files.items()})

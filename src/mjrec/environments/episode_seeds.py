@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivation of an episode's seeds from the seed of its run.
+"""Derivation of an episode's seeds from the run's seed.
 
-To reproduce them by hand::
+To reproduce the seeds by hand::
 
     words = numpy.random.SeedSequence([seed, episode]).generate_state(3)
     environment, actions, policy = (int(word) >> 1 for word in words)
 
-Each word has 32 bits. Its lowest bit is dropped, because some of the generators that
-are seeded with it accept only 31 bits. An episode's seeds depend only on `seed` and
-`episode`, so any episode can be reproduced without the episodes before it.
+Each word has 32 bits. Its lowest bit is dropped, because some generators accept only 31
+bits. An episode's seeds depend only on `seed` and `episode`, so any episode can be
+reproduced without running earlier episodes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 from ..errors import InvalidArgument
 
-# SeedSequence splits larger numbers into 32-bit words and pads with zeros, so
-# [2**32 + 5, 0] and [5, 1] would give the same episode.
+# SeedSequence splits larger numbers into 32-bit words and pads with zeros, so [2**32 +
+# 5, 0] and [5, 1] would yield the same episode.
 _LIMIT = 2**32
 
 
@@ -60,9 +60,9 @@ def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
 def seed_global_generators(seed: int) -> None:
     """Seed the generators of Python, NumPy and, if it is loaded, PyTorch.
 
-    Policies draw from these generators (`numpy.random.uniform`, dropout) without
-    knowing about any seed. Use this only in processes that mjrec starts, because a
-    user's process has its own seeds.
+    Policies may draw from these generators (`numpy.random.uniform`, dropout) instead of
+    using a seed. Call this only in processes that mjrec starts, because a user's
+    process has its own seeds.
 
     Args:
         seed: the seed, from 0 to 2**32 - 1.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Creation of an environment of any framework from its name.
+"""Creation of environments of any framework by name.
 
-A framework is loaded only when one of its environments is created. So choose the GL
-backend first.
+A framework is loaded only when one of its environments is created, so choose the OpenGL
+backend before that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def environment_from_name(
 ) -> NamedEnvironment:
     """Create the environment with the given name.
 
-    If it cannot be drawn, it is created without frames, and `not_drawn` says why.
+    If drawing is impossible, it has no frames, and `not_drawn` gives the reason.
 
     Args:
         text: see `parse_environment_name`.

@@ -30,10 +30,10 @@ from .named_environment import EnvironmentOptions, NamedEnvironment, Step
 from .names import working_directory_importable
 from .scenes import Scenes
 
-# Render modes for videos, then for text recordings.
+# The render mode for videos, then the one for text recordings.
 _PREFERRED_MODES = ("rgb_array", "ansi")
 
-# The extra that installs pygame for each family of Gymnasium's own environments.
+# For each family of Gymnasium's own environments, the extra that installs pygame.
 _PYGAME_EXTRAS = {
     "gymnasium.envs.box2d": "box2d",
     "gymnasium.envs.classic_control": "classic-control",
@@ -45,25 +45,25 @@ _VIEW_ARGUMENTS = ("camera_name", "camera_id", "default_camera_config")
 
 
 def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
-    """Create an environment with `gymnasium.make` that is ready to be recorded.
+    """Call `gymnasium.make` to create an environment that is ready for recording.
 
     If frames are requested, the render mode is `rgb_array`, or `ansi` if the
     environment has only text. A MuJoCo environment shows its model's tracking camera if
     there is one and no other view was requested. The default camera of Gymnasium 1.4
     does not move, so the robot leaves its frame. The environment's own time limit is
-    lowered to `max_steps`. If it has none, its limit is `max_steps`, or 1000 steps by
+    lowered to `max_steps`. Without one, the limit is `max_steps`, or 1000 steps by
     default.
 
     Args:
-        env_id: the id, in the form that `gymnasium.make` takes: `HalfCheetah-v5`,
+        env_id: the id, in a form that `gymnasium.make` accepts: `HalfCheetah-v5`,
             `HalfCheetah` (the latest version) or `module:Id` (the module is imported
             first).
         options: the options; `kwargs` are passed to `gymnasium.make`.
 
     Raises:
         UnknownName: the id, camera or render mode does not exist.
-        InvalidArgument: a camera or size is given, but the environment takes none.
-        NoPictures: the environment draws nothing that can be recorded.
+        InvalidArgument: a camera or size is given, but the environment accepts none.
+        NoPictures: the environment has no output that can be recorded.
         MissingDependency: a dependency is not installed.
         EnvironmentNotMade: creating the environment failed for another reason, which is
             chained.
@@ -80,8 +80,8 @@ class GymnasiumEnvironment(NamedEnvironment):
     """A Gymnasium environment.
 
     Args:
-        environment: an environment from `make_gymnasium`, or an MJCF file's.
-        not_drawn: why the environment was created without frames although they were
+        environment: an environment from `make_gymnasium` or `make_mjcf`.
+        not_drawn: why the environment was created without frames although frames were
             requested.
     """
 
@@ -131,7 +131,7 @@ def _made(
         if not any(text in str(error) for text in unknown):
             raise
         raise InvalidArgument(
-            f"{spec.id} takes no size: it chooses the size of its frames itself. "
+            f"{spec.id} takes no size, because it chooses its own frame size. "
             "Only MuJoCo environments take a size."
         ) from error
     try:
@@ -184,7 +184,7 @@ def _spec(env_id: str) -> registration.EnvSpec:
 
 @contextlib.contextmanager
 def _failures_of(env_id: str) -> Iterator[None]:
-    """Turn exceptions in third-party code into one of our errors."""
+    """Convert exceptions in third-party code to our errors."""
     try:
         yield
     except Error:
@@ -203,7 +203,7 @@ def _failures_of(env_id: str) -> Iterator[None]:
 def _what_was_raised(error: Exception) -> str:
     if str(error):
         return f"{type(error).__name__}: {error}"
-    # A bare assertion has no message, so give its location.
+    # A bare assertion has no message, so include its location.
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} in {place.filename}, line {place.lineno}"
 
@@ -214,16 +214,16 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
         raise EnvironmentNotMade(spec.id, "only its vectorized form is registered")
     if isinstance(creator, str):
         creator = registration.load_env_creator(creator)
-    # A function has no metadata, and on a wrapper's class it is a property.
+    # A function has no metadata, and in a wrapper class it is a property.
     metadata = getattr(creator, "metadata", None)
     modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
     if "render_mode" in kwargs:
         mode = kwargs["render_mode"]
         if mode in (None, "human"):
             raise _not_drawn(spec.id, f"render_mode={mode!r} was requested")
-        # Gymnasium itself collects the frames of `rgb_array` for `rgb_array_list`.
+        # Gymnasium itself collects frames from `rgb_array` for `rgb_array_list`.
         if modes is not None and str(mode).removesuffix("_list") not in modes:
-            raise UnknownName(f"render mode of {spec.id}", mode, modes)
+            raise UnknownName(f"{spec.id} render mode", mode, modes)
     else:
         # If the modes are unknown, request frames.
         there = _PREFERRED_MODES if modes is None else modes
@@ -245,7 +245,7 @@ def _not_drawn(env_id: str, why: str) -> NoPictures:
 
 
 def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
-    """Raise an error early if pygame is missing, instead of at the first frame."""
+    """Raise an error now if pygame is missing, instead of at the first frame."""
     if importlib.util.find_spec("pygame") is None:
         text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
         raise MissingDependency(
@@ -263,8 +263,8 @@ def _choose_camera(
 ) -> None:
     """Set a MuJoCo environment's camera to the requested or the tracking camera.
 
-    The camera is set on the renderer, because Gymnasium-Robotics' environments take no
-    camera argument.
+    The camera is set on the renderer, because Gymnasium-Robotics' environments accept
+    no camera argument.
     """
     chosen = [name for name in _VIEW_ARGUMENTS if name in kwargs]
     if asked is None and chosen:
@@ -286,8 +286,8 @@ def _choose_camera(
     # Not imported at the top: an environment without MuJoCo must not load it.
     from ..simulation import cameras
 
-    # An environment that shows one of its model's cameras has chosen it itself. Before
-    # 1.4, Gymnasium followed the robot.
+    # If an environment shows one of its model's cameras, that was its own choice.
+    # Before 1.4, Gymnasium followed the robot.
     if asked is None and renderer.camera_id == cameras.FREE_CAMERA:
         asked = cameras.tracking_camera(simulated.model)
     if asked is not None:

@@ -34,7 +34,7 @@ class EnvironmentFrames:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the current frame, or a list of the frames not returned so far."""
+        """Return the current frame, or a list of the frames not yet returned."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
@@ -49,7 +49,7 @@ class EnvironmentFrames:
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}
         own_facts = getattr(self._env.unwrapped, "frame_facts", None)
         if own_facts is not None:
-            # Our own environments know more than can be found out from outside.
+            # Our own environments have facts that cannot be determined from outside.
             return {**facts, **own_facts()}
         simulated = simulation_in(self._env)
         viewer = getattr(_renderer(self._env), "viewer", None)
@@ -64,7 +64,7 @@ class EnvironmentFrames:
 
 
 def close_environment(env: gymnasium.Env[Any, Any]) -> None:
-    """Close an environment, after freeing everything in its OpenGL contexts."""
+    """Free everything in an environment's OpenGL contexts, and then close it."""
     free_viewers(env)
     env.close()
 
@@ -73,7 +73,7 @@ def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
     """Free everything in an environment's OpenGL contexts, just before it is closed.
 
     Gymnasium leaves this to the garbage collector, which frees objects in whichever
-    context is then current. That turns another viewer's frames black.
+    context is then current. As a result, another viewer's frames turn black.
     """
     for viewer in getattr(_renderer(env), "_viewers", {}).values():
         with _current(viewer):
@@ -82,11 +82,11 @@ def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
 
 
 def _own_context(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:
-    """Return a context manager for drawing in the context that Gymnasium draws with.
+    """Return a context manager for drawing in Gymnasium's OpenGL context.
 
-    Gymnasium itself makes it current only when it creates the context. If two
-    environments alternated, one would be drawn with the other's meshes and textures, or
-    not at all. The previous context is current again after the block.
+    Gymnasium makes its context current only when creating it. If two environments
+    alternated, one would be drawn with the other's meshes and textures, or not at all.
+    The previous context is current again after the block.
     """
     renderer = _renderer(env)
     return contextlib.nullcontext() if renderer is None else _current(renderer.viewer)
@@ -104,5 +104,5 @@ def _current(viewer: Any) -> Iterator[None]:
 
 
 def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return Gymnasium's renderer of a MuJoCo environment, or None for others."""
+    """Return Gymnasium's renderer for a MuJoCo environment, or None for other types."""
     return getattr(simulation_in(env), "mujoco_renderer", None)

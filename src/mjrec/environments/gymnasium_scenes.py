@@ -38,8 +38,8 @@ _RENDERER = (_RENDERING, "MujocoRenderer.render")
 # exist only if it is already loaded.
 _MAZES = "gymnasium_robotics.envs.maze"
 
-# Environments whose `render` is that of an inner environment: the module, the function,
-# and the attribute that holds the inner environment.
+# Environments whose `render` calls the method of an inner environment: the module, the
+# function, and the attribute that holds the inner environment.
 _DELEGATING = (
     (f"{_MAZES}.point_maze", "PointMazeEnv.render", "point_env"),
     (f"{_MAZES}.ant_maze_v3", "AntMazeEnv.render", "ant_env"),
@@ -53,13 +53,13 @@ _DELEGATING = (
 )
 
 _ANOTHER_VIEW = (
-    "with camera, height or width the frames differ from those of render(), and are "
-    "drawn from recorded states, never live. Create the environment with them "
+    "with camera, height or width, the frames differ from those of render(), and are "
+    "drawn from recorded states, never live. Pass these to the environment "
     "(camera_name=, height=, width=), or leave out render="
 )
 
 _ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
-# The functions that draw nothing but the simulation.
+# The functions that draw only the simulation.
 _DRAWING = (
     ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render"),
     (_ROBOT_ENV, "MujocoRobotEnv.render"),
@@ -83,11 +83,11 @@ def gymnasium_scenes(
     height: int | None = None,
     width: int | None = None,
 ) -> Scenes:
-    """Return how the states of a Gymnasium environment are recorded.
+    """Return how to record the states of a Gymnasium environment.
 
     Without a camera, height or width, the frames are those of `env.render()`, and
     anything that overrides `render` is an obstacle. If any of these is given, the
-    frames show only the scene, without anything that a wrapper draws on top, and there
+    frames show only the scene, without anything drawn on top by a wrapper, and there
     are no live frames.
 
     Args:
@@ -99,8 +99,8 @@ def gymnasium_scenes(
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: the camera's number or the size is invalid, or one of them is
-            given although the environment has no MuJoCo simulation.
+        InvalidArgument: the camera's number or the size is invalid, or a camera or size
+            is given although the environment has no MuJoCo simulation.
     """
     view = {"camera": camera, "height": height, "width": width}
     own_view = any(asked is not None for asked in view.values())
@@ -137,7 +137,7 @@ def _own_view(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
 
 def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
-    """Set the camera that an environment itself shows to a recorded `own_camera`."""
+    """Set an environment's own camera to a recorded `own_camera`."""
     shown = drawn_part(env.unwrapped)
     if has_own_scenes(shown):
         shown.camera = camera
@@ -146,7 +146,7 @@ def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
 
 
 def has_own_scenes(base: Any) -> bool:
-    """Return whether an environment is one of ours, which describe themselves."""
+    """Return whether an environment is one of our own, which define `mjrec_scenes`."""
     return hasattr(type(base), "mjrec_scenes")
 
 
@@ -186,11 +186,11 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
 
 
 def _obstacle(base: Any, shown: Any) -> str | None:
-    """Return the reason why an environment shows more than its simulation, or None.
+    """Return why an environment's frames show more than the simulation, or None.
 
     Args:
         base: the environment without its wrappers.
-        shown: the part of it that is drawn.
+        shown: the inner environment that is drawn.
     """
     delegating = [(module, function) for module, function, _ in _DELEGATING]
     override = render_override("environment", base, [*delegating, *_DRAWING])
@@ -253,13 +253,13 @@ def _is_robot(drawn: Any) -> bool:
 
 
 def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
-    """Return a function that captures the moment at which an environment draws itself.
+    """Return a function that captures an environment's state at the moment of drawing.
 
     The Fetch and hand environments move their goal markers and call `mj_forward` in
     each `render`, so a frame affects the rest of the episode. The returned function
     calls `render`, replacing only the drawing itself, and then restores the simulation.
-    So the frame is the same as from `render`, and the episode is the same as without
-    rendering.
+    So the frame is the same as a frame from `render`, and the episode is the same as
+    without rendering.
 
     Args:
         drawn: an environment without its wrappers.
@@ -291,7 +291,7 @@ def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
 @contextlib.contextmanager
 def _drawing_instead(renderer: Any, capture: Callable[[], None]) -> Iterator[None]:
     """Make `renderer.render` call `capture` inside the block, and draw nothing."""
-    # The attribute of the instance hides the class's method until it is deleted.
+    # The instance's attribute hides the class's method until the attribute is deleted.
     renderer.render = lambda *_args, **_kwargs: capture()
     try:
         yield
@@ -318,7 +318,7 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def random_state(base: Any) -> Any:
-    """Return the states of the generators of an environment and its inner one.
+    """Return the generator states of an environment and its inner environment.
 
     Args:
         base: an environment without its wrappers.

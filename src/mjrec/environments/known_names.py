@@ -25,12 +25,12 @@ _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 
-# Importing tasks such as `lqr` is slow on a busy machine, but never as slow as this.
+# Importing tasks such as `lqr` is slow on a busy machine, but never takes this long.
 _TIMEOUT_S = 300
 
 
 def suite_tasks(tag: str) -> tuple[str, ...]:
-    """Return the sorted names `dm_control/<domain>-<task>` of a part of the suite.
+    """Return the sorted names `dm_control/<domain>-<task>` for part of the suite.
 
     Args:
         tag: `benchmarking`, `easy`, `hard`, `extra`, or `all`.
@@ -77,7 +77,7 @@ def mujoco_ids() -> tuple[str, ...]:
 def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
     """Return the newest version of each id, keyed by the id without its version.
 
-    An id without a version is kept only if it has no versioned sibling.
+    An id without a version is kept only if no versioned form exists.
     """
     newest: dict[str, str] = {}
     for env_id in sorted(env_ids, key=version_of):
@@ -92,7 +92,7 @@ def version_of(env_id: str) -> int:
 
 
 def dm_control_failure(name: str, error: Exception) -> Error:
-    """Return the error for an exception from importing dm_control or loading a task.
+    """Return the error to raise when importing dm_control or loading a task has failed.
 
     Args:
         name: the environment's name.
@@ -103,7 +103,7 @@ def dm_control_failure(name: str, error: Exception) -> Error:
         return MissingDependency(
             "dm_control", purpose=name, install='pip install "mjrec[dm-control]"'
         )
-    # dm_control 1.0.50 reads fields of MuJoCo's structs that mujoco 4 does not have.
+    # dm_control 1.0.50 reads fields of MuJoCo's structs that are missing from mujoco 4.
     if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
         dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
         return MissingDependency(
@@ -117,7 +117,7 @@ def dm_control_failure(name: str, error: Exception) -> Error:
 
 def _ask(*arguments: str) -> dict[str, Any]:
     """Return a child process's answer: `names`, or an error's `kind` and `text`."""
-    # Names need no OpenGL, and GLFW would complain without a display.
+    # Listing names needs no OpenGL, and GLFW would complain without a display.
     environ = {**os.environ, "MUJOCO_GL": "disabled"}
     with Child(__name__, *arguments, environ=environ) as child:
         for answer in child.messages(_TIMEOUT_S):
@@ -158,7 +158,7 @@ def _names(framework: str, what: str) -> list[str]:
 
 
 def _ids_registered_by(module: str) -> set[str]:
-    """Import a module, and return the ids that this module itself registers."""
+    """Import a module, and return the ids that it registers itself."""
     import gymnasium
     from gymnasium.envs import registration
 
@@ -168,7 +168,7 @@ def _ids_registered_by(module: str) -> set[str]:
     def noting(*args: Any, **kwargs: Any) -> None:
         before = dict(registration.registry)
         register(*args, **kwargs)
-        # Ids that other modules register while they are imported do not count.
+        # Ignore ids that other modules register while they are imported.
         if f"{_module_being_imported()}.".startswith(f"{module}."):
             after = registration.registry.items()
             registered.update(key for key, spec in after if before.get(key) is not spec)

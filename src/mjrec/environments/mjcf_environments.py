@@ -45,7 +45,7 @@ def make_mjcf(
     """
     if options.kwargs:
         raise InvalidArgument(
-            "An MJCF file takes no other arguments, but these were given: "
+            "An MJCF file accepts no other arguments, but these were given: "
             f"{dict(options.kwargs)}. The file itself defines the whole simulation."
         )
     environment = MjcfEnvironment(
@@ -65,10 +65,10 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     `ctrl`, `(nu,) float64`, within the actuators' ranges. MuJoCo clamps values outside
     the ranges, and a model without actuators takes actions of shape `(0,)`. A step
     advances the simulation to the next sixtieth of a second (see `MjcfSimulation`).
-    Every reset goes to the model's initial state, whatever the seed, because nothing
-    here is random. Rewards are 0. An episode is terminated only if the simulation
-    becomes unstable. Then `info["unstable"]` gives the reason, and the last frame and
-    observation are from before that moment.
+    Every reset restores the model's initial state regardless of the seed, because
+    nothing here is random. Rewards are 0. An episode is terminated only if the
+    simulation becomes unstable. In that case, `info["unstable"]` gives the reason, and
+    the last frame and observation are from before that moment.
 
     `metadata["render_fps"]` is the frame rate, which is 60 unless the timestep is
     longer than 1/60 second. `control_timestep()` is one over the frame rate. The model
@@ -185,7 +185,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def mjrec_scenes(
         self, *, camera: Any, height: int | None, width: int | None
     ) -> Scenes:
-        """Return how to record the states, from which frames can be drawn."""
+        """Return how to record the states from which frames can be drawn."""
         simulation = self.simulation
         scene = ViewerScene(
             simulation,
@@ -236,7 +236,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
 
 def _spec(path: Path) -> EnvSpec:
-    """Return the spec that names the environment in recordings: `mjcf/<file name>`.
+    """Return a spec with the environment's name in recordings: `mjcf/<file name>`.
 
     The spec is not registered, because no environment is created from a name in a
     recording.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An environment that was requested by name: its options, and how to run it."""
+"""An environment requested by name: its options, and how to run it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class EnvironmentOptions:
             the limit is 1000.
         frames: whether the environment will be drawn.
         seed: the run's seed, for random choices made when the environment is created.
-        kwargs: more arguments, in the form that this kind of environment takes.
+        kwargs: additional arguments, in the form that this kind of environment accepts.
 
     Raises:
         InvalidArgument: a value is invalid.
@@ -48,7 +48,7 @@ class EnvironmentOptions:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # None is valid, and means the environment's own side.
+        # None is valid and means the environment's own size.
         check_size(
             1 if self.height is None else self.height,
             1 if self.width is None else self.width,
@@ -62,7 +62,7 @@ class EnvironmentOptions:
 
     @property
     def size(self) -> dict[str, int]:
-        """The requested `height` and `width`, without values that are None."""
+        """The requested `height` and `width`, excluding None."""
         sides = {"height": self.height, "width": self.width}
         return {name: side for name, side in sides.items() if side is not None}
 
@@ -94,16 +94,16 @@ def is_terminated(timestep: Any) -> bool:
 def is_truncated(timestep: Any) -> bool:
     """Return whether an external limit ended the episode.
 
-    The time step is then LAST with a nonzero discount, because more rewards would have
-    followed.
+    In that case, the time step is LAST with a nonzero discount, because more rewards
+    would have followed.
     """
     return bool(timestep.last() and timestep.discount)
 
 
 class NamedEnvironment(abc.ABC):
-    """An environment of any framework, with a common way to run episodes.
+    """A common interface for running episodes in an environment of any framework.
 
-    In the methods, `around` is the environment or a wrapper of it, such as a monitor.
+    In the methods, `around` is the environment or its wrapper, such as a monitor.
 
     Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
@@ -112,7 +112,7 @@ class NamedEnvironment(abc.ABC):
         view: the `camera`, `height` and `width` to pass to the monitor; empty if the
             environment itself shows the requested view.
         not_drawn: why the environment cannot be drawn although frames were requested.
-        draws_when_made: whether the model depends on the seed that created the
+        draws_when_made: whether the model depends on the seed used to create the
             environment.
     """
 
@@ -132,8 +132,8 @@ class NamedEnvironment(abc.ABC):
         """Reset, and return the first observation.
 
         Args:
-            around: the environment, or a wrapper of it.
-            seeds: the episode's seeds, which also seed its source of actions.
+            around: the environment, or a wrapper around it.
+            seeds: the episode's seeds, which also seed the source of actions.
             seed: the seed for the environment's randomness from now on; None to
                 continue without setting a seed.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The names of environments, and imports of modules that users name."""
+"""The names of environments, and imports of user-specified modules."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _MJCF_SUFFIXES = (".xml", ".mjcf")
 
 @dataclass(frozen=True)
 class EnvironmentName:
-    """A parsed name of an environment.
+    """A parsed environment name.
 
     Attributes:
         framework: `"gymnasium"`, `"dm_control"` or `"mjcf"`.
-        text: an id in any form that `gymnasium.make` takes, including `module:Id`; a
+        text: an id in any form that `gymnasium.make` accepts, including `module:Id`; a
             task, `dm_control/<domain>-<task>`; or the path of an MJCF file.
     """
 
@@ -37,14 +37,14 @@ def parse_environment_name(text: str) -> EnvironmentName:
 
     Raises:
         UnknownName: the file does not exist.
-        InvalidArgument: the name is empty, lacks its task, or names another type of
+        InvalidArgument: the name is empty, lacks a task, or refers to another type of
             file.
     """
     if not text.strip():
         raise InvalidArgument(
             "An environment's name must be a Gymnasium id (HalfCheetah-v5), "
             "dm_control/<domain>-<task> (dm_control/cheetah-run) or the path of an "
-            "MJCF file (robot.xml). It is empty."
+            "MJCF file (robot.xml), not empty."
         )
     if text.startswith(_DM_CONTROL):
         task_of_suite(text)
@@ -70,7 +70,7 @@ def parse_environment_name(text: str) -> EnvironmentName:
 
 
 def task_of_suite(name: str) -> tuple[str, str]:
-    """Return the domain and the task in `dm_control/<domain>-<task>`.
+    """Return the domain and the task from `dm_control/<domain>-<task>`.
 
     Raises:
         InvalidArgument: the name has no task.
@@ -93,6 +93,6 @@ def working_directory_importable() -> Iterator[None]:
     try:
         yield
     finally:
-        # Imported code may itself have changed the list.
+        # The imported code may have changed the list.
         with contextlib.suppress(ValueError):
             sys.path.remove(directory)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies, which choose the actions of an episode.
+"""Policies, which choose the actions in an episode.
 
 =================  ==================================================================
 `random`           each action is sampled from the action space
-`zero`             each action is zero, or as close to it as the bounds allow
+`zero`             each action is zero, or as close to zero as the bounds allow
 `module:name`      an object with `predict` (Stable-Baselines3) or a function; a
                    class is called with the environment to create one of these
 `module:name()`    a function that is called with the environment and returns one of
@@ -12,8 +12,8 @@
 =================  ==================================================================
 
 A policy is called with the observation (with dm_env, the time step's observation) and
-returns an action. If it has a method `reset`, this is called with a seed at the start
-of each episode. The global generators of the process (`random`, `numpy.random` and
+returns an action. If it has a `reset` method, this is called with a seed at the start
+of each episode. The process's global generators (`random`, `numpy.random` and
 PyTorch's) are seeded with the same seed.
 """
 
@@ -43,14 +43,14 @@ logger = logging.getLogger(__name__)
 
 _BUILT_IN = ("random", "zero")
 _FORMS = (
-    "Or give module:name (a class, a function or an object), module:name(), "
+    "Or pass module:name (a class, a function or an object), module:name(), "
     "or a file (model.zip of Stable-Baselines3, .pt of TorchScript, .onnx)."
 )
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Policy:
-    """A policy for one environment. This class implements the built-in ones.
+    """A policy for one environment. This class implements the built-in policies.
 
     Args:
         environment: the Gymnasium or dm_env environment to act in.
@@ -67,7 +67,7 @@ class Policy:
         self._checked = actions.checked
 
     def reset(self, seeds: EpisodeSeeds) -> None:
-        """Prepare for an episode with these seeds, before its first action."""
+        """Prepare for an episode with these seeds, before the first action."""
         self._space.seed(seeds.actions)
 
     def __call__(self, observation: Any) -> Any:
@@ -78,12 +78,12 @@ class Policy:
         """
         if self._zero is None:
             return self._draw()
-        # Environments may keep the action that they are given, or write into it.
+        # Environments may keep or modify the action that they receive.
         return copy.deepcopy(self._zero)
 
 
 class _ForeignPolicy(Policy):
-    """A user's policy. Errors give its name, and its actions are checked."""
+    """A user's policy. Errors include its name, and its actions are checked."""
 
     def __init__(self, environment: Any, name: str, chosen: Any) -> None:
         super().__init__(environment, name)
@@ -116,15 +116,14 @@ class _ForeignPolicy(Policy):
 class _Predictor:
     """A function that calls a Stable-Baselines3 policy's `predict` for one environment.
 
-    Recurrent policies receive the last state that they returned, and whether the
-    observation is the first in its episode. Arguments that `predict` does not accept
-    are left out.
+    Recurrent policies receive their last returned state and whether the observation is
+    the first in its episode. Arguments that `predict` does not accept are left out.
     """
 
     def __init__(self, predictor: Any) -> None:
         self._predict = predictor.predict
         parameters = inspect.signature(self._predict).parameters
-        # The first parameter is the observation, whatever its name, even `state`.
+        # The first parameter is the observation, even if its name is `state`.
         self._taken = set(list(parameters)[1:])
         if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             self._taken = {"state", "episode_start", "deterministic"}
@@ -152,22 +151,22 @@ class _Predictor:
 def load_policy(
     text: str, environment: Any, kwargs: Mapping[str, Any] = _NONE
 ) -> Policy:
-    """Load the policy that `text` names; the module docstring lists the forms.
+    """Load the policy named by `text`; the module docstring lists the forms.
 
-    The working directory is importable while this runs. A policy that imports more
-    modules from there later must be used inside `working_directory_importable`.
+    The working directory is importable during this call. A policy that later imports
+    modules from there must be used inside `working_directory_importable`.
 
     Args:
         text: `random`, `zero`, `module:name`, `module:name()` or a file.
         environment: the Gymnasium or dm_env environment to act in.
-        kwargs: more arguments for calling a class or function, or for reading a file.
+        kwargs: arguments for calling a class or function, or for reading a file.
 
     Raises:
         UnknownName: the policy, the module, the name in it or the file does not exist.
         InvalidArgument: `kwargs` is given, but this kind of policy takes no arguments.
-        PolicyError: importing, reading or building the policy raised an exception,
+        PolicyError: importing, reading or creating the policy raised an exception,
             which is chained, or the result is not a policy.
-        MissingDependency: the package that reads such a file is not installed.
+        MissingDependency: the package that reads this type of file is missing.
     """
     if text in _BUILT_IN:
         _check_no_arguments(text, kwargs)
@@ -191,11 +190,11 @@ def policy_from(
             the environment to create one of these.
         name: the policy's name in messages. If it ends in `()`, `chosen` is called too.
         environment: the Gymnasium or dm_env environment to act in.
-        kwargs: more arguments for calling `chosen`.
+        kwargs: additional arguments for calling `chosen`.
 
     Raises:
         InvalidArgument: `kwargs` is given, but `chosen` is not called.
-        PolicyError: building the policy raised an exception, which is chained, or the
+        PolicyError: creating the policy raised an exception, which is chained, or the
             result is not a policy.
     """
     if inspect.isclass(chosen) or name.endswith("()"):
@@ -210,7 +209,7 @@ def policy_from(
         except ValueError:
             # Some classes written in C have no signature.
             pass
-        with _failures_named(f"Building the policy {name} with the environment"):
+        with _failures_named(f"Creating the policy {name} with the environment"):
             chosen = chosen(environment, **kwargs)
     else:
         _check_no_arguments(name, kwargs)
@@ -218,7 +217,7 @@ def policy_from(
 
 
 def policy_file(text: str) -> Path | None:
-    """Return the file that a loaded policy comes from.
+    """Return the file from which a policy was loaded.
 
     Args:
         text: the name that was passed to `load_policy`.
@@ -266,11 +265,11 @@ def _import(module_name: str, text: str) -> ModuleType:
         try:
             return importlib.import_module(module_name)
         except ModuleNotFoundError as error:
-            # A module that this module imports may be missing too.
+            # The missing module may also be one that this module imports.
             if not f"{module_name}.".startswith(f"{error.name}."):
                 raise
             raise UnknownName(
-                "module for a policy",
+                "policy module",
                 module_name,
                 sorted(
                     p.stem for p in Path.cwd().glob("*.py") if p.stem.isidentifier()
@@ -280,7 +279,7 @@ def _import(module_name: str, text: str) -> ModuleType:
 
 
 def _offered(module: ModuleType) -> list[str]:
-    """Return the names of a module's objects that could be policies."""
+    """Return the names of objects in a module that could be policies."""
     return sorted(
         name
         for name, value in vars(module).items()
@@ -293,7 +292,7 @@ def _offered(module: ModuleType) -> list[str]:
 
 @contextlib.contextmanager
 def _failures_named(*what: str) -> Iterator[None]:
-    """Turn exceptions in third-party code into a PolicyError with their location."""
+    """Convert exceptions in third-party code to a PolicyError with the location."""
     try:
         yield
     except Error:

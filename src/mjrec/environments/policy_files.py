@@ -4,15 +4,15 @@
 =================  ==================================================================
 `.zip`             written by `model.save()` of Stable-Baselines3. It acts as in
                    `predict`: without noise, within the action bounds, and with its
-                   state if it is recurrent
+                   state if recurrent
 `.pt` `.pth`       TorchScript, written by `torch.jit.save`: takes a float32 tensor of
 `.torchscript`     shape (1, n); the first row of its output is the action
 `.pt2`             the same, written by `torch.export.save`
 `.onnx`            the same, run by onnxruntime on the CPU
 =================  ==================================================================
 
-An observation with several parts is concatenated if the file takes a single array.
-Reading a model.zip or TorchScript runs code in it, so read only files that you trust.
+An observation with several parts is concatenated if the file expects one array. Reading
+a model.zip or TorchScript file runs its code, so read only trusted files.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..errors import MissingDependency, PolicyError, UnknownName
 
 
 def file_of_policy(text: str) -> Path | None:
-    """Return the file that a policy's name refers to, or None if it is not one.
+    """Return the file that a policy name refers to, or None if it is not a file name.
 
     Raises:
         UnknownName: the name is a file name, but the file does not exist.
@@ -57,14 +57,14 @@ def policy_in_file(path: Path, environment: Any, **kwargs: Any) -> Any:
         **kwargs: `device`, for a model.zip or TorchScript; `"cpu"` by default.
 
     Raises:
-        MissingDependency: the package that reads such a file is not installed.
+        MissingDependency: the package that reads this type of file is missing.
         PolicyError: the file does not contain a policy.
     """
     return _READERS[path.suffix](path, environment, **kwargs)
 
 
 class _Model:
-    """A Stable-Baselines3 policy: the part of an algorithm that acts."""
+    """The policy of a Stable-Baselines3 algorithm, without the code for learning."""
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy
@@ -94,7 +94,7 @@ def _stable_baselines3(path: Path, _environment: Any, *, device: str = "cpu") ->
     )
     if not data or "policy_class" not in data:
         raise PolicyError(
-            f"The policy {path} is not a model of Stable-Baselines3. Write one with "
+            f"The policy {path} is not a Stable-Baselines3 model. Save one with "
             "model.save()."
         )
     arguments = {k: v for k, v in data["policy_kwargs"].items() if k != "device"}
@@ -119,7 +119,7 @@ def _torch(
             module = torch.jit.load(path, map_location=device).eval()
     except RuntimeError as error:
         raise PolicyError(
-            f"The policy {path} does not contain a network. Write it with "
+            f"The policy {path} does not contain a network. Save one with "
             "torch.jit.trace(network, observation).save(path), or torch.export.save: "
             "weights alone do not define a network."
         ) from error
@@ -143,7 +143,7 @@ def _onnx(path: Path, environment: Any) -> Callable[[Any], Any]:
 def _network(
     outputs: Callable[[NDArray[np.float32]], Any], environment: Any
 ) -> Callable[[Any], Any]:
-    """Return a policy that acts with a network, which maps rows to rows."""
+    """Return a policy that uses a network to map observation rows to action rows."""
     # Not imported at the top, because it loads Gymnasium.
     from .actions import action_space
 
@@ -158,7 +158,7 @@ def _network(
 
 
 def _row(observation: Any) -> NDArray[np.float32]:
-    """Return the numbers of an observation, concatenated."""
+    """Return all numbers in an observation as one row."""
     parts = observation.values() if isinstance(observation, Mapping) else [observation]
     return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that recreate the environment of a recording, or refuse to.
+"""Functions that recreate the environment of a recording if this is safe.
 
 A recording may be untrusted, and creating an environment runs the environment's code.
-So nothing that a recording names is imported. An environment is created only if its id
+So no module named in a recording is imported. An environment is created only if its id
 is already in the installed registry and belongs to Gymnasium itself, Gymnasium-Robotics
 or dm_control's suite. Its arguments must be plain values within bounds and name no
-files. Wrappers must be Gymnasium's own, with such arguments. The reader may trust more
-ids, one by one.
+files. Wrappers must be Gymnasium's own, and their arguments must meet the same
+conditions. The reader may trust more ids individually.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from .gymnasium_scenes import drawn_part, random_state, set_own_camera
 from .scenes import class_name, generator_state, set_generator_state, simulation_below
 from .wrapping import StandIn, stand_ins
 
-# Packages of the registry's entry points that are trusted by default.
+# Packages whose entry points in the registry are trusted by default.
 _TRUSTED = (
     *("gymnasium.envs.mujoco", "gymnasium.envs.classic_control"),
     *("gymnasium.envs.toy_text", "gymnasium_robotics"),
 )
 _ROBOTICS = "gymnasium_robotics"
 
-# Arguments of gymnasium.make itself, not of an environment.
+# Arguments for gymnasium.make itself, not for an environment.
 _MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
 
 # A plain word, which cannot be a path or a file name with an extension.
@@ -45,8 +45,8 @@ _FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
 _RENDER_MODES = (None, "rgb_array", "rgb_array_list", "ansi", "depth_array")
 _MOST_VALUES = 10_000
 _LARGEST = 1e9
-# The limit for numbers that cost memory or time: frames, skipped frames, stacks. It
-# does not apply to a suite task's `random`, which is a seed.
+# The limit for numbers that affect memory or time: frames, skipped frames, stacks. A
+# suite task's `random` is a seed, so the limit does not apply to it.
 _LARGEST_COUNT = 10_000
 
 _SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
@@ -60,7 +60,7 @@ class NotRecreated(Exception):
 
     Args:
         reason: the clause.
-        excuse: the part that the reader does not have: "environment" or "wrappers".
+        excuse: the component that the reader lacks: "environment" or "wrappers".
     """
 
     def __init__(self, reason: str, *, excuse: str = "environment") -> None:
@@ -74,7 +74,7 @@ class Recreated:
 
     Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
-        is_dm_env: whether it is a `dm_env.Environment`.
+        is_dm_env: whether the environment is a `dm_env.Environment`.
         stand_in: the wrapper that replays recorded steps if the recorded wrappers are
             not available; otherwise None.
     """
@@ -110,14 +110,14 @@ class Recreated:
             ) from error
 
     def seed(self, seed: int) -> None:
-        """Seed dm_control's generator; for Gymnasium, `reset` does this."""
+        """Seed dm_control's generator; Gymnasium environments are seeded by `reset`."""
         self._dm_generator().seed(seed)
 
     def seed_behind(self, state: Any) -> int | None:
-        """Return the seed of a generator that has not been used yet, or None.
+        """Return the seed that produced an unused generator's state, or None.
 
-        This works only for dm_control, because NumPy's legacy generator starts with its
-        seed as the first word.
+        This works only for dm_control, because the state of NumPy's legacy generator
+        starts with its seed.
         """
         key = state.get("state", {}).get("key") if isinstance(state, Mapping) else None
         if not self.is_dm_env or not isinstance(key, list) or not key:
@@ -177,10 +177,9 @@ def recreate(
 
     Args:
         recorded: `framework`, `id`, `kwargs`, `wrappers` and so on, from the journal.
-        own_camera: the camera that the environment itself showed, if it was set after
-            creation.
-        trust: more ids that the reader trusts, `Id` or `module:Id`. The module must
-            come from the reader, never from the recording.
+        own_camera: the environment's own camera, if it was set after creation.
+        trust: additional ids that the reader trusts, `Id` or `module:Id`. The module
+            must come from the reader, never from the recording.
         mjcf: the author's MJCF file and its model, for an environment made from a file.
 
     Raises:
@@ -214,7 +213,7 @@ def recreate(
 
 
 def checked_options(options: Any) -> dict[str, Any] | None:
-    """Return the options of a reset, if they are plain values.
+    """Return the options of a reset if they are plain values.
 
     Raises:
         NotRecreated: the options are not plain values.
@@ -238,7 +237,7 @@ def _gymnasium(
     entry_point = _entry_point(env_id)
     if trusted is None and not any(_is_below(entry_point, each) for each in _TRUSTED):
         raise NotRecreated(
-            f"it would run code from the archive: {env_id!r:.100} is not one of the "
+            f"this would run code from the archive: {env_id!r:.100} is not one of the "
             "environments of Gymnasium, Gymnasium-Robotics or dm_control that are "
             f"installed here. If you trust it, use --trust {env_id:.100}"
         )
@@ -265,7 +264,7 @@ def _gymnasium(
 
 
 def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
-    """Put an environment inside a recording's wrappers, or inside stand-ins."""
+    """Wrap an environment in a recording's wrappers, or in stand-ins."""
     names = [str(name) for name in recorded.get("wrappers") or ()]
     arguments = recorded.get("wrapper_arguments") or [None] * len(names)
     if len(arguments) != len(names):
@@ -341,12 +340,12 @@ def _dm_control(
 
 
 def _are_plain(arguments: Mapping[str, Any]) -> bool:
-    """Return whether all arguments are plain values within bounds, and name no file."""
+    """Return whether all arguments are plain values within bounds, naming no files."""
     return all(_is_plain_item(*item) for item in arguments.items())
 
 
 def _is_plain_item(name: Any, value: Any) -> bool:
-    """Return whether an argument is a plain value within bounds, and names no file."""
+    """Return whether an argument is a plain value within bounds that names no file."""
     if not isinstance(name, str) or _FILES.search(name):
         return False
     if name != "random" and isinstance(value, int) and abs(value) > _LARGEST_COUNT:
@@ -374,7 +373,7 @@ def _entry_point(env_id: str) -> Any:
     """Return the entry point of an id in the installed registry, or None."""
     spec = registration.registry.get(env_id)
     if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
-        # The package registers its environments on import. Its name comes from us.
+        # The package registers its environments on import. The name is our constant.
         with contextlib.suppress(Exception):
             importlib.import_module(_ROBOTICS)
         spec = registration.registry.get(env_id)
@@ -387,7 +386,7 @@ def _is_below(entry_point: Any, package: str) -> bool:
 
 
 def _is_in_suite(env_id: str) -> bool:
-    """Return whether an id is that of a task in the installed suite."""
+    """Return whether an id refers to a task in the installed suite."""
     # If dm_control does not work, none of its tasks counts as installed.
     with contextlib.suppress(Exception):
         from .dm_control_environments import suite
@@ -399,7 +398,7 @@ def _is_in_suite(env_id: str) -> bool:
 
 @contextlib.contextmanager
 def _failures(what: str) -> Iterator[None]:
-    """Turn any exception in an environment's own code into `NotRecreated`."""
+    """Convert any exception in an environment's own code to `NotRecreated`."""
     try:
         yield
     except NotRecreated:

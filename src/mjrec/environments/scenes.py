@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Facts about an environment that a monitor needs to record its states and frames."""
+"""The facts that a monitor needs to record an environment's states and frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class NoFrameSource:
     """The source of frames for an environment that cannot be drawn live.
 
     Args:
-        missing: what the environment lacks, and a remedy.
+        missing: a clause that states what is missing, and a remedy.
     """
 
     render_mode = None
@@ -54,24 +54,23 @@ _NO_FRAMES: Final = NoFrameSource("")
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """The recording of an environment's states, and whether they determine its frames.
+    """How to record an environment's states, and whether they determine its frames.
 
     Attributes:
         states: the capture of the states; None if no MuJoCo simulation was found.
         obstacle: why frames of the environment cannot be drawn from its states, as a
-            clause that names the overriding class; None if nothing but missing states
-            prevents it.
+            clause that names the overriding class; None if only missing states prevent
+            it.
         environment: the facts needed to recreate the environment: `framework`
-            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
-            are unknown, or JSON cannot represent them); None if the environment has no
-            name.
+            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if
+            unknown or not representable in JSON); None if the environment has no name.
         random_state: a function that returns the current state of the environment's
             random generators as JSON-compatible values, or None if there is no
             generator yet. It does not create a generator.
         frames: the source of live frames.
         own_view: the `own_camera` that the environment itself shows, for the journal;
             empty for a free camera. The camera may differ from the environment's
-            arguments, because it can be changed later.
+            arguments, because it can be changed after creation.
     """
 
     states: Capture | None = None
@@ -83,7 +82,7 @@ class Scenes:
 
 
 def simulation_below(env: Any) -> Any:
-    """Return the object with an environment's MuJoCo model and data, or None.
+    """Return the object that holds an environment's MuJoCo model and data, or None.
 
     Our own environments keep them in a separate object.
     """
@@ -92,7 +91,7 @@ def simulation_below(env: Any) -> Any:
 
 
 def mujoco_warnings(env: Any) -> dict[str, int]:
-    """Return the number of MuJoCo's warnings since the last reset, by kind."""
+    """Return the counts of MuJoCo's warnings since the last reset, by kind."""
     simulated = simulation_below(env)
     if simulated is None:
         return {}
@@ -103,16 +102,16 @@ def mujoco_warnings(env: Any) -> dict[str, int]:
 
 
 def new_warnings(before: Mapping[str, int], env: Any) -> dict[str, int]:
-    """Return MuJoCo's warnings by kind since `mujoco_warnings` returned `before`."""
+    """Return the counts of MuJoCo's warnings, by kind, that are not in `before`."""
     after = mujoco_warnings(env)
-    # MuJoCo may reset an unstable simulation, and the counts with it.
+    # MuJoCo may reset an unstable simulation together with its counts.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
     counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
     return {name: n for name, n in counts.items() if n}
 
 
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
-    """Return whether a function is the one defined in a module's own source.
+    """Return whether a function is defined in a module's own source.
 
     A replacement does not count, even if it has the same name or a decorator copied the
     name.
@@ -134,17 +133,17 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
 
 
 def has_own_method(instance: Any, name: str) -> bool:
-    """Return whether an object has its own method in place of its class's.
+    """Return whether an object has a method of its own, instead of its class's method.
 
-    This function does not use `__dict__`: in CPython 3.11 and 3.12, reading it once
-    makes every later access to the object's attributes several times slower. That
+    This function does not use `__dict__`, because in CPython 3.11 and 3.12, a single
+    read makes every later access to the object's attributes several times slower. That
     increases the instruction count of a HalfCheetah step by 2%.
     """
     own = getattr(instance, name, None)
     of_class = getattr(instance.__class__, name, None)
     if own is of_class:
         return False
-    # A weak proxy does not give access to the object itself.
+    # A weak proxy provides no access to the object itself.
     is_stand_in = type(instance) in weakref.ProxyTypes
     is_bound = is_stand_in or getattr(own, "__self__", None) is instance
     function = getattr(own, "__func__", None)
@@ -154,10 +153,10 @@ def has_own_method(instance: Any, name: str) -> bool:
 def render_override(
     what: str, drawn: Any, known: Iterable[tuple[str, str]]
 ) -> str | None:
-    """Return the reason why frames may differ, if `render` is overridden, or None.
+    """Return the reason why frames may differ if `render` is overridden, or None.
 
     Args:
-        what: what `drawn` is, for the reason.
+        what: a noun that describes `drawn`, for the returned reason.
         drawn: the object whose `render` is called.
         known: the modules and qualified names of the functions that do not count as
             overriding `render`.
@@ -214,7 +213,7 @@ def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def shown_arguments(kwargs: Any) -> str:
-    """Return the arguments that an environment was created with, as `name=value, ...`.
+    """Return the arguments used to create an environment, as `name=value, ...`.
 
     Args:
         kwargs: the arguments from a recording; any value is accepted.
@@ -235,7 +234,7 @@ def shown_arguments(kwargs: Any) -> str:
 
 
 def shown_wrappers(environment: Mapping[str, Any]) -> list[str]:
-    """Return `Name(argument=value, ...)` for each wrapper, starting at the outermost.
+    """Return `Name(argument=value, ...)` for each wrapper, outermost first.
 
     Args:
         environment: the facts about the environment in a recording; any values are
@@ -262,7 +261,7 @@ def _lists(value: Any) -> Any:
 
 
 def _arrays(state: Any) -> Any:
-    """Return a random state in NumPy's form, with lists converted to arrays."""
+    """Return a random state in NumPy's format, with lists converted to arrays."""
     if isinstance(state, Mapping):
         return {name: _arrays(value) for name, value in state.items()}
     return np.array(state, dtype=np.uint64) if isinstance(state, list) else state

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene that Gymnasium's off-screen viewer shows, even before it is created.
+"""The scene that Gymnasium's off-screen viewer shows or would show.
 
-This module imports mujoco through `simulation`, so load it only if there is a
-simulation.
+This module imports mujoco through `simulation`. Load it only if there is a simulation.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _SIDE = 480
 # The limit that our own renderer uses if the environment has no renderer.
 _MAX_GEOM = 10000
 
-# These are read at every captured step with one call each, and then compared at once.
+# Each is called once at every captured step; its values are compared together.
 _OF_SIMULATION = attrgetter("mujoco_renderer", "model", "data")
 _OF_RENDERER = attrgetter("model", "camera_id", "_viewers")
 _NO_VIEWERS: dict[str, Any] = {}
@@ -43,8 +42,8 @@ class ViewerScene:
     """The scene shown by an environment's viewer.
 
     If the environment has a viewer for `rgb_array`, the scene has the viewer's own
-    camera and options, including the user's changes. Before that, it is the scene that
-    a viewer created at the first frame would show, as long as the environment keeps its
+    camera and options, including the user's changes. Until then, it is the scene that a
+    viewer created at the first frame would show, as long as the environment keeps its
     renderer.
 
     Args:
@@ -101,12 +100,12 @@ class ViewerScene:
     def forget(self) -> None:
         """Treat the next frame as if it were the first.
 
-        A viewer that the environment already has is not changed.
+        An existing viewer is not changed.
         """
         self._start()
 
     def is_unmoved(self) -> bool:
-        """Check quickly whether the view is certainly the same as for the last frame.
+        """Check quickly whether the view is known to be unchanged since the last frame.
 
         Changes to the model, the camera and the option are not checked for. The result
         is True if the simulation is the same as when the view was returned, and there
@@ -126,7 +125,7 @@ class ViewerScene:
         return None if viewer is None else _addition(viewer, self._new_flags)
 
     def _label(self) -> str | int | dict[str, Any]:
-        """Return the camera's label for the metadata. It is cached, as it is slow."""
+        """Return the camera's metadata label, which is cached because it is slow."""
         asked = self._camera if self._asked is None else self._asked
         seen = (self._model, asked, *_pose(self._camera))
         if self._labelled is None or self._labelled[0] != seen:
@@ -144,7 +143,7 @@ class ViewerScene:
         flags = getattr(self._renderer, "_vopt", None)
         copy_members(viewer_option(flags), self._option)
         if self._asked is not None:
-            # In another model the name may have a different number.
+            # In another model, the name may refer to a different number.
             camera = resolve_camera(self._model, self._asked)
             copy_members(camera, self._camera)
 
@@ -167,7 +166,7 @@ class ViewerScene:
         if self._asked is None and renderer is not None:
             self._update_own_camera(viewer)
         elif self._asked is None or self._asked == FREE_CAMERA:
-            # The free camera moves with the model's fields.
+            # The free camera's pose depends on the model's fields.
             place_free_camera(self._model, self._camera)
 
     def _update_own_camera(self, viewer: Any) -> None:
@@ -205,11 +204,11 @@ def _own_side(simulated: Any, name: str) -> int:
 
 
 def _addition(viewer: Any, new_flags: bytes) -> str | None:
-    """Return a description of what a viewer shows beyond the scene, or None."""
+    """Return a description of what a viewer shows in addition to the scene, or None."""
     if viewer._markers:
         return "markers were added to the viewer"
     if viewer._overlays:
-        return "text was laid over the viewer's frames"
+        return "the viewer's frames have a text overlay"
     if viewer.pert.select or viewer.pert.active:
         return "a body is selected in the viewer"
     if viewer.scn.flags.tobytes() != new_flags:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wrappers between a monitor and the environment that it records.
+"""The wrappers between a monitor and the recorded environment.
 
-An action recorded above a wrapper may differ from the action that the environment
-received, so recreating the environment includes recreating its wrappers.
+A wrapper may change an action before the environment receives it, so recreating the
+environment includes recreating its wrappers.
 
 Wrappers that are not available are replaced by a `StandIn`, which steps the simulation
-underneath with the recorded controls instead of the wrapper's output for an action. If
-its own rewards and episode ends differ from the recorded ones, which may come from the
-wrapper, the recorded values are passed on and counted. Actions that differ from the
-controls are counted too, because nothing proves that the actions led to these controls.
+with the recorded controls instead of the wrapper's output for an action. If the
+simulation's rewards and episode ends differ from the recorded ones, which may come from
+the wrapper, the recorded values are passed on and counted. Actions that differ from the
+controls are also counted, because there is no proof that they led to these controls.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from .scenes import class_name, plain_arguments
 
-# Wrappers that pass on actions, rewards and episode ends unchanged. `TimeLimit` does
-# not, but it is recorded separately, as a number.
+# Wrappers that pass on actions, rewards and episode ends unchanged. `TimeLimit` changes
+# episode ends, but it is recorded separately, as a number.
 _TRANSPARENT = frozenset(
     {
         "gymnasium.wrappers.common.OrderEnforcing",
@@ -42,7 +42,7 @@ _INNERMOST = (
     "dm_control.rl.control.Environment",
     "dm_control.composer.environment.Environment",
 )
-# Attributes in which dm_env's and dm_control's wrappers keep the inner environment.
+# Attributes in which wrappers from dm_env and dm_control keep the inner environment.
 _INSIDE = ("_env", "_environment", "environment")
 
 
@@ -69,11 +69,11 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
 
 def around_dm_env(env: Any) -> dict[str, Any]:
-    """Return the same facts about a dm_env environment. Limits are dm_control's own.
+    """Return the same facts for a dm_env environment. Limits are dm_control's own.
 
-    An inner environment is not found if the name of its attribute is unknown. In that
-    case, the wrapper counts as the environment, but is still listed in `wrappers`,
-    because it is not one of dm_control's environments.
+    If the attribute of an inner environment has an unknown name, the wrapper counts as
+    the environment. It is still listed in `wrappers`, because it is not from
+    dm_control.
     """
     layers: list[Any] = []
     while class_name(type(env)) not in _INNERMOST:
@@ -99,7 +99,7 @@ def _changing(layers: Iterable[Any]) -> list[Any]:
 
 
 def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
-    """Return the arguments of a Gymnasium wrapper, or None if it does not keep them.
+    """Return the arguments of a Gymnasium wrapper, or None if they are unknown.
 
     The result is also None if JSON cannot represent an argument, such as a function.
     """
@@ -110,7 +110,7 @@ def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
 
 
 def _own(env: Any, name: str) -> Any:
-    """Return an attribute of an object itself, not one of an object that it wraps.
+    """Return an attribute of an object itself, not of an object that it wraps.
 
     The object's `__dict__` is not used, for the reason given in `has_own_method`.
     """
@@ -141,8 +141,8 @@ class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A wrapper that steps an environment with recorded controls.
 
     Attributes:
-        differing: number of steps in this episode whose recorded reward or end differs.
-        translated: number of steps in it whose action differs from the controls.
+        differing: number of this episode's steps whose recorded reward or end differs.
+        translated: number of this episode's steps whose action and controls differ.
     """
 
     differing = translated = 0

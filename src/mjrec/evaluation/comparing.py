@@ -5,7 +5,7 @@ All figures compare B with A: differences are B - A, and the probability of impr
 is the probability that B has a higher return than A. If each side is a single
 evaluation, the figures are computed from its episodes and apply only to these two
 policies. If a side has several evaluations, one per training run, the figures are
-computed from the mean returns of the evaluations and apply to the two methods. See
+computed from the evaluations' mean returns and apply to the two methods. See
 `docs/reference/statistics.md`.
 """
 
@@ -34,9 +34,9 @@ TASK_FIGURES: Final = (
     *("mean A", "mean B", "difference", "paired difference"),
     *(IMPROVEMENT, "p-value"),
 )
-"""Names of the figures for one task, in the order in which tables list them."""
+"""Names of the figures for one task, in the order used in tables."""
 OVERALL_FIGURES: Final = (IMPROVEMENT, "IQM A", "IQM B", "IQM difference")
-"""Names of the figures for all tasks together, in the order used in tables."""
+"""Names of the figures across all tasks, in the order used in tables."""
 
 _MOST_TOLD: Final = 10
 
@@ -56,7 +56,7 @@ class TaskComparison:
             the mean returns of the evaluations. The paired difference uses episodes
             that began in the same state. The p-value is from the two-sided Mann-Whitney
             test and is adjusted for the number of tasks by Holm's method.
-        pairs: number of episode pairs that the paired difference is computed from.
+        pairs: number of episode pairs used for the paired difference.
         unknown: the reason why there are no figures; None if there are figures.
     """
 
@@ -79,11 +79,11 @@ class Comparison:
         unit: the unit of resampling: `"episodes"` if each side has one evaluation,
             otherwise `"evaluations"`.
         policies: the policies of A and B.
-        cautions: reasons not to trust the figures, such as different conditions or
-            failed episodes.
+        cautions: reasons to doubt the figures, such as different conditions or failed
+            episodes.
         remarks: other differences, which do not affect the figures.
-        left_out: for A and B, the tasks that the other side does not have in all of its
-            evaluations.
+        left_out: for A and B, the tasks that are missing from an evaluation on the
+            other side.
         tasks: the comparison on each common task, in A's order.
         figures: the available figures, keyed by their names in `OVERALL_FIGURES`: the
             probability of improvement, averaged over tasks, and the interquartile means
@@ -202,7 +202,7 @@ def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
     The k-th smallest of m p-values (counted from 0) is multiplied by m - k and capped
     at 1. If the result is smaller than the adjusted value before it, that value is used
     instead. If every adjusted value below 0.05 is reported as a difference, then at
-    most 5 in 100 comparisons contain a false report.
+    most 5 in 100 comparisons contain a false positive.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0
@@ -241,7 +241,7 @@ class _Side:
         return _listed(each.plan.policy_and_kwargs for each in self.results)
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
-        """Return the tasks of this side except the given ones."""
+        """Return this side's tasks, excluding the given ones."""
         return tuple(task for task in self.tasks if task not in tasks)
 
     def returns(self, task: str) -> list[FloatArray]:
@@ -250,12 +250,12 @@ class _Side:
         return [each.rows["total_reward"][~each.failed] for each in columns]
 
     def sample(self, task: str, is_single: bool) -> FloatArray:
-        """Return the returns if `is_single`, or else the mean of each evaluation."""
+        """Return all returns if `is_single`, otherwise each evaluation's mean."""
         returns = self.returns(task)
         return returns[0] if is_single else np.array([r.mean() for r in returns])
 
     def counts(self, task: str) -> tuple[int, int, int]:
-        """Return the number of completed episodes, failed episodes and bad returns."""
+        """Return the numbers of completed episodes, failures and non-finite returns."""
         failed = sum(len(each.by_task[task].failures) for each in self.results)
         returns = np.concatenate(self.returns(task))
         return len(returns), failed, _not_finite(returns)
@@ -326,7 +326,7 @@ def _by_unit(columns: TaskResults) -> dict[tuple[int, int], float]:
 
 
 def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:
-    """Return the score ranges, by task, on which all evaluations agree."""
+    """Return the score ranges that are the same in all evaluations, keyed by task."""
     said: dict[str, set[tuple[float, float] | None]] = {}
     for each in results:
         for summary in each.summaries:
@@ -349,7 +349,7 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
     for name, of_a, of_b in _different(a, b, _conditions):
         yield (
             f"{name} is {of_a} in A and {of_b} in B, and returns under different "
-            "conditions do not show which policy is better"
+            "conditions cannot show which policy is better"
         )
     for task in tasks:
         for name, failed, completed in zip(
@@ -363,7 +363,7 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
 
 
 def _conditions(results: Evaluation) -> Mapping[str, object]:
-    """Return the conditions that affect the returns of a policy."""
+    """Return the conditions that affect a policy's returns."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The results of episodes, read from the journals in the directory of a chunk.
+"""Episode results, read from the journals in a chunk's directory.
 
-An episode of an evaluation has up to three lines in a journal. The line `begun` is
-written before the reset. The line for the end of the episode is either the journal's
-usual line, with an additional field `evaluation`, or a line `failed`::
+An episode in an evaluation has up to three lines in a journal. The `begun` line is
+written before the reset. The line for the end of the episode is either the usual
+journal line with an additional field, `evaluation`, or a `failed` line::
 
     {"begun": {"seed": 7, "episode": 0}}
     {"episode_id": 0, "length": 200, ..., "evaluation": {"seed": 7, "episode": 0,
@@ -12,8 +12,8 @@ usual line, with an additional field `evaluation`, or a line `failed`::
      "length": 12, "start_time": 1790000000.0, "seconds": 0.2}}
 
 A monitor records in its journal that it was closed, and a process that is stopped from
-outside appends `{"begun": null}`. If none of these lines follows a `begun`, the process
-crashed or was killed during that episode.
+outside appends `{"begun": null}`. If none of these lines follows a `begun` line, the
+process crashed or was killed during that episode.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class EpisodeResult:
 
     @property
     def reward(self) -> float | None:
-        """The return, under the name that the keep rules expect."""
+        """The return, under the name used by the keep rules."""
         return self.total_reward
 
     @property

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`evaluate`, which distributes an evaluation to workers and writes the results.
 
-Workers record the episodes, one chunk at a time. The calling process does not simulate
-anything, and it needs OpenGL only to draw the videos at the end. It can be killed at
-any time: a resumed evaluation does not repeat finished work.
+Workers record the episodes, one chunk at a time. The calling process simulates nothing
+and needs OpenGL only to draw the videos at the end. It can be killed at any time: a
+resumed evaluation does not repeat finished work.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ logger = logging.getLogger(__name__)
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
-# By default the number of a library's threads depends on the machine, and so does the
-# order in which numbers are added. That would change the results. The worker processes
+# By default, the number of threads in a library depends on the machine, and so does the
+# order in which numbers are added. This would change the results. The worker processes
 # keep all CPUs busy anyway.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -101,7 +101,7 @@ def evaluate(
     The trajectory of every episode is kept, so any episode can be rendered later. An
     episode fails if the policy or the environment raises an exception, or if an action
     is NaN or has the wrong shape. The other episodes still run. If a worker dies during
-    an episode, the episode is retried. It fails after three deaths.
+    an episode, the episode is retried. After three deaths, it fails.
 
     A worker creates the environment and the policy once per task and resets them for
     each episode. There are two exceptions. An environment that draws its model from the
@@ -126,20 +126,20 @@ def evaluate(
         num_seeds: number of seeds, counted from 0, instead of `seeds`. Defaults to 5.
         workers: number of worker processes, which also render. Defaults to one per
             usable CPU. If `engine` is a name, this is the number of the engine's
-            workers. The results do not depend on the number.
-        keep: rule that chooses the episodes of each task that get a video: `best[:N]`,
+            workers. The results do not depend on this number.
+        keep: rule that chooses the episodes of each task for videos: `best[:N]`,
             `median`, `worst[:N]` and `failures[:N]`, joined by commas; or `cubic`,
             `all` or `none`. Defaults to `"best,median,worst"`.
         protocol: `"seeded"` (the default): episode i of seed s starts from
             `SeedSequence([s, i])`. `"suite"`: the episodes of a task and a seed s share
-            one random stream, which is seeded with s.
-        resume: continue the evaluation in the directory without repeating finished
+            one random stream, seeded with s.
+        resume: continue the evaluation in the directory without rerunning finished
             episodes. Arguments that are None keep their earlier values. You may add
             tasks, seeds and (except with `"suite"`) episodes. Everything else must be
             the same, including the policy's code and weights.
         force: delete the evaluation in the directory first.
         max_steps: truncate episodes after this many steps. None for the environment's
-            limit, or for 1000 steps if it has no limit.
+            limit, or 1000 steps if it has no limit.
         episode_timeout: maximum duration of an episode in seconds. An episode that
             takes longer fails, and its worker is terminated.
         camera: the camera for the videos. None for the model's tracking camera, if
@@ -154,9 +154,9 @@ def evaluate(
         score_ranges: for each task, the returns that correspond to scores of 0 and 1.
             Scores make tasks comparable. dm_control tasks have default ranges.
         confidence: confidence level of the intervals.
-        on_progress: called with the progress several times a second.
+        on_progress: a function that is called with the progress several times a second.
         engine: an executor to use instead of child processes, or `"local"`, `"ray"` or
-            `"slurm"`. Its workers also render. All of them must see the directory under
+            `"slurm"`. Its workers also render. All workers must see the directory under
             the same path. The results do not depend on the engine.
 
     Returns:
@@ -168,7 +168,7 @@ def evaluate(
             installed.
         DifferentEvaluation: `resume` was given with different options.
         DirectoryInUse: another evaluation is using the directory.
-        PolicyError: the policy cannot be built or sent to other processes.
+        PolicyError: the policy cannot be created or sent to other processes.
         Error: an argument, a task or the policy is invalid. All of the errors above
             are raised before any episode runs.
     """
@@ -311,7 +311,7 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
-    """Replace options that are None by their earlier values or their defaults."""
+    """Replace options that are None with their earlier values or their defaults."""
     if begun is not None and given["max_fps"] == DEFAULT_FPS:
         given["max_fps"] = None
     earlier = _DEFAULTS if begun is None else vars(begun)
@@ -348,7 +348,7 @@ def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str
             **environ_for_drawing(),
         }
     if not keep_rule(plan.keep).keeps_none:
-        # Checked now, so that a problem does not show up hours later. A task that is
+        # Checked now, so that a problem does not appear hours later. A task that is
         # drawn live needs the backend in its worker.
         try:
             wanted[_GL] = choose().backend
@@ -358,10 +358,10 @@ def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str
 
 
 def _clear(directory: Path) -> None:
-    """Delete the evaluation in a directory, if there is one, and nothing else.
+    """Delete only the evaluation in a directory, if there is one.
 
     Raises:
-        DirectoryInUse: a monitor of the evaluation is still open.
+        DirectoryInUse: a monitor in the evaluation is still open.
     """
     if not (directory / PLAN_NAME).exists():
         return
@@ -379,7 +379,7 @@ def _clear(directory: Path) -> None:
 
 @contextlib.contextmanager
 def _held(directory: Path) -> Iterator[None]:
-    """Lock the directory against other evaluations."""
+    """Lock the directory to exclude other evaluations."""
     lock = try_lock(directory / _LOCK_NAME)
     if lock is None:
         raise DirectoryInUse(

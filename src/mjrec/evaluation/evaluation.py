@@ -53,7 +53,7 @@ RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
 
 class ChosenEpisode(NamedTuple):
-    """An episode that was chosen to get a video.
+    """An episode that was chosen for a video.
 
     Attributes:
         seed: the seed of the episode's run.
@@ -77,14 +77,13 @@ class Evaluation:
         summaries: summaries of the tasks, in the plan's order.
         across: the summary of all tasks that have a scale; None if it was not computed.
         bootstrap: settings for the confidence intervals.
-        selection: the episodes that were chosen to get a video, by task.
-        versions: versions of the packages that were used, by package.
+        selection: the episodes that were chosen for videos, by task.
+        versions: versions of the packages used, keyed by package name.
         by_task: the episodes of each task, in the plan's order.
         videos: paths of the finished videos. Only set by a run; empty if the results
             were read from files.
-        pending: reasons why chosen videos are missing, keyed by the paths that the
-            videos will get. Only set by a run; empty if the results were read from
-            files.
+        pending: reasons why chosen videos are missing, keyed by the videos' future
+            paths. Only set by a run; empty if the results were read from files.
     """
 
     directory: Path
@@ -109,7 +108,7 @@ class Evaluation:
         return list(self)
 
     def _repr_html_(self) -> str:
-        """Return HTML for notebooks, with a row per task and the finished videos."""
+        """Return HTML for notebooks: a row for each task, and the finished videos."""
         facts = {"episodes": len(self.results), "directory": self.directory}
         level = f"{100 * self.bootstrap.confidence:g}%"
         columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
@@ -147,9 +146,9 @@ class Evaluation:
         return self.directory / name
 
     def file_of(self, result: EpisodeResult) -> Path | None:
-        """Return the path of an episode's video, or of its trajectory without a video.
+        """Return the path of an episode's video, or of its trajectory if there is none.
 
-        Return None if both files are missing.
+        The result is None if both files are missing.
         """
         key = result.key
         if key is None:
@@ -179,16 +178,16 @@ def write_results(
     tables of one plan together with the summaries of another.
 
     Args:
-        evaluation: everything but the episodes.
+        evaluation: the evaluation's data, except the episodes.
         results: the results of all episodes in the plan, in the plan's order.
-        files: a function that returns the files of an episode.
+        files: a function that returns an episode's files.
 
     Raises:
         FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
     directory, plan = evaluation.directory, evaluation.plan
     content = _ResultsFile(
-        # Chunks are left out because they depend on when episodes were added, and that
+        # Chunks are left out, because they depend on when episodes were added, which
         # must not change the results.
         plan=replace(plan, chunks=()),
         selection=_Selection(rule=plan.keep, by_task=evaluation.selection),
@@ -254,9 +253,9 @@ def read_summaries(directory: Path) -> Evaluation:
 
 
 def results_in(directory: Path) -> Iterator[tuple[EpisodeResult, Path | None]]:
-    """Yield the results of an evaluation, finished or not, and the videos' paths.
+    """Yield the results of a finished or unfinished evaluation, and the videos' paths.
 
-    The episodes are in the plan's order. Videos are None if it is not finished.
+    The episodes are in the plan's order. Paths are None for an unfinished evaluation.
 
     Raises:
         UnreadableFile: the plan or a journal cannot be read.
@@ -308,7 +307,7 @@ class _Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class _ResultsFile:
-    """The content of `results.json`, in the order of the file."""
+    """The content of `results.json`, in file order."""
 
     plan: Annotated[EvaluationPlan, _plan]
     selection: _Selection

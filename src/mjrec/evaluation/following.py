@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distribution of an evaluation to workers, from its start to the drawn videos.
+"""Distribution of an evaluation to workers, from the start to the finished videos.
 
-The results of episodes are read from the chunks' journals, never from the return values
-of workers.
+The episodes' results are read from the chunks' journals, never from the workers' return
+values.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from .result_tables import EpisodeFiles
 
 logger = logging.getLogger(__name__)
 
-# The number of seconds between progress reports, and the maximum share of the time that
-# is spent on counting finished episodes.
+# The number of seconds between progress reports, and the maximum share of time spent on
+# counting finished episodes.
 _SECONDS_BETWEEN_REPORTS = 0.25
 _MOST_OF_TIME = 0.05
 
@@ -51,7 +51,7 @@ class EvaluationProgress:
         failed: number of failed episodes.
         total: total number of episodes.
         videos_done: number of finished videos.
-        videos: total number of videos that are known so far.
+        videos: total number of videos known so far.
         frames_done: number of frames drawn so far; 0 if an engine's workers draw the
             videos.
         frames: total number of frames in the videos; 0 if an engine's workers draw the
@@ -72,7 +72,7 @@ _Tell = Callable[[EvaluationProgress], object]
 
 @dataclass
 class ChunkRun:
-    """The current state of a chunk of a task.
+    """The current state of a task's chunk.
 
     Attributes:
         task: the task.
@@ -80,7 +80,7 @@ class ChunkRun:
         folder: the chunk's monitor directory.
         known: the chunk's finished episodes, as last read.
         size: value of `ChunkResults.size` when the chunk was last submitted.
-        reason: the reason to give for episodes that have no result.
+        reason: the reason reported for episodes that have no result.
     """
 
     task: EvaluatedTask
@@ -97,18 +97,18 @@ class ChunkRun:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all episodes of the chunk have a result."""
+        """Whether all episodes in the chunk have results."""
         return all(unit in self.known.results for unit in self.chunk)
 
     @property
     def is_finished(self) -> bool:
-        """Whether the chunk is complete, and its recordings are finished too."""
+        """Whether the chunk is complete and its recordings are finished."""
         return self.is_complete and not any(
             has_leftovers(files) for files in monitors_of(self.folder)
         )
 
     def result(self, unit: Unit) -> EpisodeResult:
-        """Return the result of an episode, which has failed if no result is known."""
+        """Return the result of an episode, or a failure if no result is known."""
         return self.known.results.get(unit) or EpisodeResult(
             task=self.task.name,
             seed=unit[0],
@@ -123,7 +123,7 @@ class ChunkRun:
 
 @dataclass(frozen=True)
 class Choice:
-    """The episodes that get a video.
+    """The episodes chosen for videos.
 
     Attributes:
         selection: the chosen episodes of each task.
@@ -147,11 +147,11 @@ def check_tasks(
     Args:
         run: the workers.
         plan: the plan of the evaluation.
-        workers: number of workers to start if there are new tasks. Each worker has to
-            create an environment sooner or later, so they all do it now, in parallel.
+        workers: number of workers to start if there are new tasks. Each worker must
+            create an environment eventually, so all workers do so now, in parallel.
 
     Returns:
-        The plan with the tasks' step limits, and for each new task a rough measure of
+        The plan with the tasks' step limits, and for each new task, a rough measure of
         the cost of a step.
 
     Raises:
@@ -194,8 +194,8 @@ def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
 def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationProgress:
     """Run the missing episodes of all chunks, and return the final progress.
 
-    A killed process may have left all results of a chunk, but its recordings
-    unfinished. Such a chunk is also submitted, because its job finishes them.
+    A killed process may have left a chunk with all results but unfinished recordings.
+    Such a chunk is also submitted, because its job finishes the recordings.
 
     Args:
         run: the workers.
@@ -215,14 +215,14 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
             # Models that this process's own workers stored can be trusted.
             note_models((outcome.value or {}).get("models", ()))
             if not each.is_complete and each.known.size > each.size:
-                # There was progress, so the chunk is submitted again. An episode that
+                # There was progress, so the chunk is resubmitted. An episode that
                 # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
             if outcome.failure or not each.is_complete:
                 said = outcome.failure or (
-                    f"A worker finished {each.folder}, but the recordings are missing "
-                    "there. All machines must see the directory under the same path."
+                    f"A worker finished {each.folder}, but its recordings are missing "
+                    "here. All machines must see the directory under the same path."
                 )
                 logger.warning("%s", said)
                 each.reason = said.partition(" Its last output")[0]
@@ -262,13 +262,13 @@ def choose_videos(
     chunks: Sequence[ChunkRun],
     results: Mapping[str, Sequence[EpisodeResult]],
 ) -> Choice:
-    """Choose the episodes that get a video, and write the choice to the folders."""
+    """Choose the episodes for videos, and write the choice to the folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
     chunk_of = _by_monitor(chunks)
     for task, of_task in results.items():
-        # The order in which ties are broken must depend only on the episodes.
+        # The tie-breaking order must depend only on the episodes.
         own = sorted(of_task, key=lambda each: each.unit)
         kept = keep_rule(plan.keep).choose([each if each.key else None for each in own])
         roles: dict[Path, dict[RecordingKey, list[str]]] = {}
@@ -302,7 +302,7 @@ def choose_videos(
 def files_of(
     evaluation: Evaluation, chunks: Iterable[ChunkRun]
 ) -> Callable[[EpisodeResult], EpisodeFiles]:
-    """Return a function that looks up the files of an episode."""
+    """Return a function that looks up an episode's files."""
     chunk_of = _by_monitor(chunks)
     chosen = {
         (task, each.seed, each.episode)
@@ -401,7 +401,7 @@ def draw_videos(
 def _by_monitor(
     chunks: Iterable[ChunkRun],
 ) -> dict[tuple[str, str | None], ChunkRun]:
-    """Return the chunks, by task and by the monitors that recorded them."""
+    """Return the chunks, keyed by task and monitor."""
     return {
         (each.task.name, result.monitor): each
         for each in chunks
@@ -410,7 +410,7 @@ def _by_monitor(
 
 
 def _submit(run: Run, each: ChunkRun) -> str:
-    # A chunk is only submitted again when its size has grown, so the key is unique.
+    # A chunk is resubmitted only if its size has grown, so the key is unique.
     each.size = each.known.size
     key, chunk = f"{each.place}/{each.size}", dataclasses.asdict(each.chunk)
     run.submit(key, kind="run", task=each.task.name, folder=each.place, chunk=chunk)

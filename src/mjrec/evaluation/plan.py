@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of an evaluation, the plan's chunks, and its file, `evaluation.json`.
+"""The plan of an evaluation, its chunks, and the file `evaluation.json`.
 
 The file is written before any episode runs.
 """
@@ -29,7 +29,7 @@ from ..json_text import dumps
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
 
-# The warning to log, with the reason, if videos cannot be drawn.
+# The warning to log if videos cannot be drawn, followed by the reason.
 NO_GL = (
     "Videos cannot be drawn on this machine, so the chosen videos will stay pending "
     "(use --keep none to choose no videos): %s"
@@ -66,13 +66,13 @@ class EvaluatedTask:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Episodes of a task that one job runs and records in one monitor directory.
+    """Episodes of one task that a single job runs and records in one monitor directory.
 
     Attributes:
         folder: base name of the monitor directory in the folder of each task.
         seeds: seeds of the episodes, in ascending order.
         first: number of the first episode of each seed.
-        stop: number after the last episode of each seed.
+        stop: one more than the number of the last episode of each seed.
     """
 
     folder: Annotated[str, base_name]
@@ -94,8 +94,8 @@ class Chunk:
 class EvaluationPlan:
     """The checked plan of an evaluation, stored in `evaluation.json`.
 
-    When the file is read, types and ranges are checked, but not whether the tasks and
-    the rule exist.
+    When the file is read, types and ranges are checked, but the existence of the tasks
+    and the rule is not.
 
     Attributes:
         tasks: the tasks, in the order of the results.
@@ -110,11 +110,10 @@ class EvaluationPlan:
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
             `"suite"`: the episodes of a task and seed share one random stream.
         chunks: the chunks into which the episodes of each task are divided.
-        keep: rule that chooses the episodes that get a video; see
-            `recorder.keep_rules`.
+        keep: rule that chooses the episodes for videos; see `recorder.keep_rules`.
         max_steps: number of steps after which an episode is truncated; None for the
-            environment's own limit, or for 1000 steps if it has no limit.
-        episode_timeout: seconds after which an episode fails; None for no timeout.
+            environment's own limit, or 1000 steps if it has no limit.
+        episode_timeout: timeout for an episode, in seconds; None for no timeout.
         camera: the camera for the videos; None for the model's tracking camera, if
             there is one.
         height: height of the videos; None for the environment's default.
@@ -146,7 +145,7 @@ class EvaluationPlan:
 
     @property
     def policy_and_kwargs(self) -> str:
-        """The policy and its keyword arguments, as text for people."""
+        """The policy and its keyword arguments, as human-readable text."""
         return ", ".join([self.policy, *kwargs_as_text(self.policy_kwargs)])
 
     def __iter__(self) -> Iterator[Unit]:
@@ -157,7 +156,7 @@ class EvaluationPlan:
 
 
 def kwargs_as_text(kwargs: Mapping[str, Any]) -> list[str]:
-    """Return keyword arguments as in a call."""
+    """Return keyword arguments as written in a call."""
     return [f"{name}={value!r}" for name, value in kwargs.items()]
 
 
@@ -174,7 +173,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
     """Read the plan of the evaluation in a directory.
 
     Raises:
-        UnreadableFile: the plan is missing, damaged or in a different format version.
+        UnreadableFile: the plan is missing, damaged or of a different format version.
     """
     path = directory / PLAN_NAME
     with unreadable(path):
@@ -193,7 +192,7 @@ def read_versioned(path: Path) -> Mapping[str, Any]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file contains no JSON object of this version.
+        ValueError: the file does not contain a JSON object in this format version.
     """
     value = json_fields.read_object(path)
     version = json_fields.field(value, "format_version", json_fields.integer)
@@ -208,12 +207,12 @@ def read_versioned(path: Path) -> Mapping[str, Any]:
 def check_continues(
     directory: Path, begun: EvaluationPlan, asked: EvaluationPlan
 ) -> None:
-    """Check that a new plan can continue an evaluation that was begun.
+    """Check that a new plan can continue an existing evaluation.
 
     The new plan may have different tasks, additional seeds and more episodes. With the
-    protocol `"suite"`, it must not have more episodes, because the number of episodes
-    is part of the unit of work. Any other difference would change results or videos.
-    Episodes must not be dropped, because their returns may already be known.
+    protocol `"suite"`, it must not have more episodes, because all episodes of a seed
+    form one unit of work. Any other difference would change results or videos. Episodes
+    must not be dropped, because the user may already have seen their returns.
 
     Args:
         directory: the evaluation's directory, for the error message.

@@ -20,7 +20,7 @@ _SIGNS: Final[dict[str, Callable[[float, float], bool]]] = {
     "<=": operator.le,
 }
 _NO_SCORES: Final = (
-    ", because no task has the same score range in all evaluations: give it with "
+    ", because no task has the same score range in all evaluations: set one with "
     "mjrec evaluate --resume DIR --score-range TASK=LOW:HIGH"
 )
 _FORM: Final = re.compile(
@@ -31,12 +31,12 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True)
 class Requirement:
-    """A requirement on a figure of a comparison.
+    """A requirement for a figure in a comparison.
 
     Attributes:
         text: the requirement as the user wrote it.
-        task: name of the task. None means all tasks together if there is such a figure,
-            and otherwise each task separately.
+        task: name of the task. None means the figure across all tasks if there is one,
+            otherwise each task separately.
         figure: the figure's name.
         end: `"low"` or `"high"` for an end of the figure's interval; None for the
             figure itself.
@@ -99,6 +99,6 @@ def parse_requirement(text: str) -> Requirement:
     task, figure = match["task"], match["figure"]
     figures = TASK_FIGURES if task else {*TASK_FIGURES, *OVERALL_FIGURES}
     if figure not in figures:
-        raise UnknownName("figure of a comparison", figure, figures)
+        raise UnknownName("comparison figure", figure, figures)
     number = float(match["number"])
     return Requirement(text, task, figure, match["end"], match["sign"], number)

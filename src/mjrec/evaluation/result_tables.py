@@ -7,16 +7,16 @@ for any number of workers, no matter how often the evaluation was killed and res
     task,seed,episode,return,length,terminated,truncated,success,failure
 
 Truth values are `true`, `false` or, if unknown, empty. Numbers are written with
-Python's `repr`, so reading them returns exactly the same values. A failure is a single
-line.
+Python's `repr`, so reading them yields exactly the same values. The text of a failure
+is a single line.
 
 `timing.csv` contains the facts that differ between runs: wall-clock times and the files
 of each episode. It has one row for each row of `results.csv`, in the same order::
 
     task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 
-The files are untrusted: all values that are used are checked, lines must be shorter
-than `_LONGEST_LINE`, and rows are read into arrays, never into one object per row.
+The files are untrusted: all values are checked before use, lines must be shorter than
+`_LONGEST_LINE`, and rows are read into arrays instead of one object per row.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ _TIMES: Final = ("start_time", "seconds")
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """The files of an episode.
+    """An episode's files.
 
     Attributes:
         folder: path of the monitor directory, relative to the evaluation's directory;
             None if the episode has no files.
         trajectory: base name of the trajectory; None if the episode has no trajectory.
-        video: base name of the finished or pending video; None if the episode gets no
+        video: base name of the finished or pending video; None if the episode has no
             video.
     """
 
@@ -186,7 +186,7 @@ def write_timing_table(
     Args:
         file: the file, opened with `newline=""`.
         results: all episodes, in the plan's order.
-        files: a function that returns the files of an episode.
+        files: a function that returns an episode's files.
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_TIMING)
@@ -208,8 +208,8 @@ def read_tables(
         timing: the path of `timing.csv`. If the file is missing, times and files are
             unknown.
         plan: the plan of the evaluation. The tables must contain exactly the episodes
-            of the plan.
-        needs_timing: whether `timing.csv` must exist as well.
+            in the plan.
+        needs_timing: whether `timing.csv` must also exist.
 
     Raises:
         UnreadableFile: a table is damaged or missing, or belongs to a different plan.
@@ -325,7 +325,7 @@ def _truth_text(value: bool | None) -> str:
 
 
 def _one_line(text: str) -> str:
-    # A failed episode must have text here, even if the error has no message.
+    # A failed episode must have a reason, even if the error has no message.
     shown = "".join(c if c.isprintable() else " " for c in _encodable(text))
     return " ".join(shown.split())[:_LONGEST_FAILURE] or "unknown"
 

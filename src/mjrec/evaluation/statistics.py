@@ -2,7 +2,7 @@
 """Statistical figures for returns and scores, with confidence intervals.
 
 Every figure is defined once, as a function that reduces the last axis of its samples.
-SciPy's bootstrap can therefore evaluate thousands of resamples at once.
+SciPy's bootstrap can therefore evaluate thousands of resamples together.
 `docs/reference/statistics.md` lists the formulas and their sources. The tests compare
 the figures with rliable and with values computed by hand.
 
@@ -34,7 +34,7 @@ MOST_RESAMPLED: Final = 3000
 
 _MOST_RESAMPLES: Final = 1_000_000
 
-# Number of values in a block of resamples. They take 2 MB, which fits in a CPU cache.
+# Number of values in a block of resamples. A block takes 2 MB, to fit in a CPU cache.
 _BLOCK: Final = 1 << 18
 
 
@@ -131,7 +131,7 @@ class Figure:
     def interval_method(self) -> str | None:
         """Name of the method for intervals; None if a sample has only one value.
 
-        In that case the interval would have zero width and suggest certainty.
+        In that case, the interval would have zero width and suggest certainty.
         """
         sizes = [len(sample) for sample in self.samples]
         if min(sizes) < 2:
@@ -139,7 +139,7 @@ class Figure:
         return PERCENTILE_BOOTSTRAP if sum(sizes) <= MOST_RESAMPLED else LARGE_SAMPLE
 
     def ends(self, how: Bootstrap) -> tuple[FloatArray, FloatArray] | None:
-        """Return the lower and upper ends of the intervals, or None without them."""
+        """Return the lower and upper ends of the intervals; None without intervals."""
         if self.interval_method is None:
             return None
         if self.interval_method == LARGE_SAMPLE:
@@ -177,7 +177,7 @@ class Figure:
 
 
 def average(figures: Iterable[Figure]) -> Figure:
-    """Return the mean of several figures, which all have the same weight.
+    """Return the mean of several figures, all with the same weight.
 
     The samples of the figures must be independent, such as those of different tasks.
     """
@@ -206,7 +206,7 @@ def mean(sample: FloatArray) -> Figure:
 
 
 def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
-    """Return the mean of the middle half of all samples pooled together.
+    """Return the mean of the middle half of the pooled samples.
 
     Of all n values, the floor(n / 4) smallest and the floor(n / 4) largest are left
     out. Larger samples have more weight.
@@ -290,7 +290,7 @@ def improvement(x: FloatArray, y: FloatArray) -> Figure:
 
 
 def _placements(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the share of `y` below each value of `x`. Ties count as one half."""
+    """Return the share of `y` below each value in `x`. Ties count as one half."""
     y = np.sort(y)
     below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
     return np.asarray((below + up_to) / (2 * len(y)))
@@ -317,7 +317,7 @@ def load_scipy() -> None:
     """Start a thread that loads SciPy, which takes a second, while workers run."""
 
     def load() -> None:
-        # If SciPy is missing, the code that uses it will report that.
+        # If SciPy is missing, the code that uses it will report the error.
         with contextlib.suppress(ImportError):
             _stats()
 

@@ -2,7 +2,7 @@
 """Summaries of a single task and of all tasks together.
 
 Failed episodes have no return. They are counted but not included in the figures, so
-claims about a task are sound only if `failed` and `not_finite` are 0.
+conclusions about a task are valid only if `failed` and `not_finite` are 0.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class TaskSummary:
 
     Attributes:
         task: the task's name.
-        runs: number of seeds with episodes, or of monitors if a monitor directory is
-            summarized.
+        runs: number of seeds with episodes, or number of monitors if a monitor
+            directory is summarized.
         episodes: number of completed episodes. The figures are computed from these.
         failed: number of failed episodes.
         mean: mean return.
@@ -48,16 +48,16 @@ class TaskSummary:
         mean_length: mean length of the episodes, in steps.
         terminated: number of episodes that the task ended.
         truncated: number of episodes that a limit outside the task ended.
-        success_known: number of episodes for which success or its absence is known. If
-            the task reports success at all, failed episodes count as unsuccessful.
+        success_known: number of episodes known to be successful or unsuccessful. If the
+            task reports success, failed episodes count as unsuccessful.
         success_rate: share of successful episodes among the `success_known` episodes.
         success_interval: Wilson's interval for the success rate.
         warnings: number of MuJoCo warnings, by kind.
         score_range: the returns that correspond to scores of 0 and 1; None if the task
             has no scale.
-        not_finite: number of returns that are NaN or infinite. If there are such
-            returns, no figures are computed from the returns: with them the figures
-            would be meaningless, and without them the figures would be misleading.
+        not_finite: number of returns that are NaN or infinite. If there are any, no
+            figures are computed from the returns: including them would make the figures
+            meaningless, and excluding them would make the figures misleading.
         interval_method: name of the method for the intervals of the mean and the
             interquartile mean.
     """
@@ -93,8 +93,8 @@ class Profile:
     Attributes:
         thresholds: the thresholds, in ascending order.
         shares: share of scores above each threshold, averaged over tasks.
-        low: lower ends of the pointwise intervals. Equal to `shares` without intervals,
-            that is, if `AcrossTasks.interval_method` is None.
+        low: lower ends of the pointwise intervals. Equal to `shares` if there are no
+            intervals (`AcrossTasks.interval_method` is None).
         high: upper ends of the pointwise intervals. Equal to `shares` without
             intervals.
     """
@@ -151,13 +151,13 @@ def summarize_task(
 ) -> TaskSummary:
     """Summarize the episodes of one task.
 
-    All arrays have one element per completed episode, in the same order. Changing the
-    order affects the figures only by rounding errors. A million episodes take a second.
+    All arrays have one element per completed episode, in the same order. The order
+    affects the figures only by rounding errors. A million episodes take a second.
 
     Args:
         task: the task's name.
         total_rewards: the returns.
-        runs: number of seeds or monitors that the episodes come from.
+        runs: number of seeds or monitors that produced the episodes.
         lengths: lengths in steps; empty if they were not recorded.
         terminated: whether the task ended each episode; empty if not recorded.
         truncated: whether a limit outside the task ended each episode; empty if not

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Task names that users give: environments, sets of environments and patterns.
+"""User-specified task names: environments, sets of environments and patterns.
 
 ======================  ==============================================================
 `HalfCheetah-v5`        an environment as in `mjrec record`: a Gymnasium id,
@@ -47,7 +47,7 @@ _WILD = re.compile(r"[*?\[]")
 
 
 def tasks_from(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return the environments that the strings name, in order, without duplicates.
+    """Return the environments named by the strings, in order, without duplicates.
 
     Raises:
         UnknownName: a set or file does not exist, or nothing matches a pattern.
@@ -89,7 +89,7 @@ def _named(text: str) -> Sequence[str]:
 
 
 def _is_set(text: str) -> bool:
-    """Return whether a name cannot be anything but a set."""
+    """Return whether a name can only be a set."""
     framework, colon, name = text.partition(":")
     if not colon or _WILD.search(name):
         return False
@@ -105,7 +105,7 @@ def _matching(pattern: str) -> Sequence[str]:
     known = list(_candidates(module, wanted))
     newest = newest_versions(known)
     matching = [newest[name] for name in newest if fnmatch.fnmatchcase(name, wanted)]
-    # If nothing matches without versions, the pattern must include versions.
+    # If nothing matches without versions, the pattern must include a version.
     matching = matching or [n for n in known if fnmatch.fnmatchcase(n, wanted)]
     if not matching:
         raise UnknownName(
@@ -125,7 +125,7 @@ def _candidates(module: str, wanted: str) -> Iterator[str]:
         yield from suite_tasks("all")
         return
     if not module and _SUITE.startswith(beginning):
-        # Not an error, because the pattern may mean other environments.
+        # Not an error, because the pattern may be for other environments.
         with contextlib.suppress(MissingDependency):
             yield from suite_tasks("all")
     yield from gymnasium_ids(module)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The worker process of an evaluation, which runs the missing episodes of chunks.
+"""An evaluation's worker process, which runs the missing episodes in chunks.
 
 The settings are `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`.
 If the policy is an object, `"payload"` is the path of the file with the pickled policy.
 If `"chooses_gl"` is true and episodes get videos, the worker chooses an OpenGL backend
-that works on its machine. `"command"` is the command line that recordings name.
+that works on its machine. `"command"` is the command line to store in recordings.
 
-There are two kinds of jobs. It is safe to repeat a job.
+There are two kinds of jobs, and repeating a job is safe.
 
 `check`  Creates the environment and the policy without taking a step. The arguments are
          `{"task"}`. Returns `{"step_limit", "velocities"}`, where `velocities` is the
@@ -20,7 +20,7 @@ There are two kinds of jobs. It is safe to repeat a job.
 The environment and the policy are reused for all chunks of a task. They are recreated
 in three cases:
 
-- after a failed episode, because the environment may be in any state;
+- after a failed episode, because the environment's state is unknown;
 - for each seed, if the environment draws its model from the seed when it is created
   (dm_control's `lqr`);
 - for each episode that is drawn live, because its frames would depend on earlier
@@ -88,7 +88,7 @@ class Acting:
 
     Attributes:
         task: the environment's name.
-        seed: the seed that the environment was created with.
+        seed: the seed used to create the environment.
         named: the environment.
         policy: the policy.
         is_drawn_live: whether frames are drawn while the environment is stepped.
@@ -105,7 +105,7 @@ class EvaluationWorker:
     """A handler for `engines.jobs` that runs an evaluation's jobs.
 
     Args:
-        settings: the settings, which the module docstring describes.
+        settings: the settings, as described in the module docstring.
 
     Attributes:
         plan: the plan of the evaluation, without its chunks.
@@ -122,8 +122,8 @@ class EvaluationWorker:
         self._draws = not keep_rule(self.plan.keep).keeps_none
         self._acting: Acting | None = None
         self.journal: Path | None = None
-        # If dm_control finds no other backend, it tries GLFW, which warns on a headless
-        # machine that there is no display. If that matters, drawing will report it.
+        # If dm_control finds no other backend, it tries GLFW, which warns about a
+        # missing display on a headless machine. If that matters, drawing will fail.
         warnings.filterwarnings("ignore", message=r"\(65550\) b'X11")
         if settings.get("chooses_gl") and self._draws:
             try:
@@ -163,7 +163,7 @@ class EvaluationWorker:
         return {"models": list(dict.fromkeys(models))}
 
     def leave(self) -> None:
-        """Record that the running episode is not the reason why this process ends."""
+        """Record that the running episode did not cause this process to end."""
         if self.journal is not None:
             with self.journal.open("ab") as file:
                 file.write(b'{"begun": null}\n')
@@ -192,7 +192,7 @@ class EvaluationWorker:
         return continues or (is_of_seed and not known.is_drawn_live)
 
     def acting(self, task: str, seed: int) -> Acting:
-        """Return the environment and the policy, and create them if there are none.
+        """Return the environment and the policy, creating them if necessary.
 
         Raises:
             Error: see `environment_from_name`, `load_policy` and `policy_from`.
@@ -269,7 +269,7 @@ class _ChunkRun:
         self._open = contextlib.ExitStack()
 
     def run(self) -> None:
-        """Run the episodes that have no result yet.
+        """Run the episodes that have no results yet.
 
         No other process may write to the folder, and the recordings of killed processes
         must have been recovered.
@@ -294,9 +294,9 @@ class _ChunkRun:
     def _run_stream(self, seed: int, missing: set[int]) -> None:
         """Run the missing episodes of a seed that share a random stream.
 
-        The stream continues from one episode to the next. Finished episodes that come
-        before a missing one therefore run again, but without being recorded. After a
-        failed episode a new stream begins.
+        The stream continues from one episode to the next. Finished episodes that
+        precede a missing one are therefore rerun, but not recorded. After a failed
+        episode, a new stream begins.
         """
         stream: int | None = seed
         for number in range(self._chunk.first, max(missing) + 1):
@@ -334,7 +334,7 @@ class _ChunkRun:
         before: dict[str, int] = {}
 
         def count_warnings() -> None:
-            # Not every reset clears the warning counts.
+            # Some resets do not clear the warning counts.
             before.update(mujoco_warnings(acting.named.environment))
 
         def facts() -> Mapping[str, Any]:
@@ -349,8 +349,8 @@ class _ChunkRun:
                 _play(acting, monitor, unit, stream, on_begin=count_warnings)
         # A policy or an environment's library may call sys.exit().
         except (Exception, SystemExit) as error:
-            # Our own errors are about the recording, such as a full disk, unless they
-            # are about an invalid action or reward.
+            # Our own errors concern the recording, such as a full disk, unless they
+            # concern an invalid action or reward.
             if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
             logger.warning("An episode failed with this error:", exc_info=True)
@@ -358,7 +358,7 @@ class _ChunkRun:
             times = {"start_time": start, "seconds": time.time() - start}
             failed = _failed(unit, _in_one_line(error), **times)
             if monitor.episode_id > episode_id:
-                # Otherwise the monitor does not know the episode.
+                # Otherwise the episode is unknown to the monitor.
                 length = monitor.stats_recorder.steps or 0
                 failed.update(episode_id=episode_id, length=length)
             monitor.recorder.run.note("failed", failed)
@@ -367,7 +367,7 @@ class _ChunkRun:
         return True
 
     def _acting(self, unit: Unit, *, continues: bool = False) -> Acting:
-        """Return an environment and a policy for an episode, new ones if necessary."""
+        """Return an episode's environment and policy, creating them if necessary."""
         if not self._worker.fits(self._task, unit[0], continues=continues):
             self._renew()
         return self._worker.acting(self._task, unit[0])
@@ -402,7 +402,7 @@ class _ChunkRun:
         return self._monitor
 
     def _renew(self) -> None:
-        """Close the monitor and the environment, so that both are created anew."""
+        """Close the monitor and the environment, so that both will be recreated."""
         self._monitor = self._worker.journal = None
         self._open.close()
         self._worker.close()

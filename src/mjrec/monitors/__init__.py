@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors, which translate an environment's calls into those of the recorder.
+"""Monitors, which translate calls to an environment into calls to the recorder.
 
 Each framework has its own module here, which is imported only when one of its
 environments is monitored.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base classes of the monitors, with the methods that gym's monitor had."""
+"""Base classes for monitors, with the methods of gym's monitor."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ NO_SIMULATION = "it has no accessible MuJoCo model and data"
 
 
 class MonitorBase:
-    """Base class of the monitors of single and of vector environments.
+    """Base class for monitors of single environments and vector environments.
 
-    It has gym's methods and is a context manager. Leaving the `with` block waits for
-    the videos, unless an exception was raised.
+    It has the methods of gym's monitor and is a context manager. Leaving the `with`
+    block waits for the videos, unless an exception was raised.
 
     Attributes:
         allows_early_reset: whether the framework allows a reset during an episode.
@@ -65,7 +65,7 @@ class MonitorBase:
         return self._recorders[0].directory
 
     def set_monitor_mode(self, mode: str | None) -> None:
-        """Set the type of episodes, starting with the next reset.
+        """Set the type of the episodes that start from the next reset.
 
         Args:
             mode: "training", "evaluation", or None for training.
@@ -77,7 +77,7 @@ class MonitorBase:
             recorder.stats_recorder.type = type_of_mode(mode)
 
     def get_total_steps(self) -> int:
-        """Return the total number of steps, including those of unfinished episodes."""
+        """Return the total number of steps, including steps in unfinished episodes."""
         return sum(each.stats_recorder.total_steps for each in self._recorders)
 
     def close(self, *, wait: bool = True) -> None:
@@ -95,7 +95,7 @@ class MonitorBase:
             RenderError: videos could not be rendered; everything else is finished, and
                 their trajectories are kept.
             FileNotWritten: the disk is full; the next call will retry.
-            Error: this process was forked from the one that created the monitor.
+            Error: this process was forked from the process that created the monitor.
         """
         for recorder in self._recorders:
             recorder.check_process()
@@ -121,11 +121,11 @@ class MonitorBase:
         logger.warning("%s", error)
 
     def _finish(self, on_progress: Callable[[Any], None]) -> None:
-        """End all episodes, then wait until all videos are rendered."""
+        """End all episodes, and wait until all videos are rendered."""
         call_all(functools.partial(r.finish, on_progress) for r in self._recorders)
 
     def _note_error(self, error: BaseException) -> None:
-        """Note an exception from the environment or from the user's code."""
+        """Record an exception from the environment or from the user's code."""
         for recorder in self._recorders:
             recorder.note_error(error)
 
@@ -164,7 +164,7 @@ class MonitorBase:
 
 
 class EnvironmentMonitor(MonitorBase):
-    """Base class of the monitors of single environments."""
+    """Base class for monitors of single environments."""
 
     _recorder: Recorder
     # Closed with the monitor; empty if its user closes the environment.
@@ -176,12 +176,12 @@ class EnvironmentMonitor(MonitorBase):
         return self._recorder
 
     def leave_environment_open(self) -> None:
-        """Make `close` keep the environment open, because it will be used again."""
+        """Make `close` keep the environment open, because it will be reused."""
         self._environments.clear()
 
     @property
     def infix(self) -> str:
-        """The middle part of the names of this monitor's files."""
+        """The middle part of this monitor's file names."""
         return self._recorder.infix
 
     @property
@@ -191,7 +191,7 @@ class EnvironmentMonitor(MonitorBase):
 
     @property
     def stats_recorder(self) -> StatsRecorder:
-        """The recorder of steps and rewards."""
+        """The recorder for steps and rewards."""
         return self._recorder.stats_recorder
 
     @property
@@ -203,34 +203,34 @@ class EnvironmentMonitor(MonitorBase):
         return self._recorder.video_recorder
 
     def get_episode_rewards(self) -> list[float]:
-        """Return the sum of rewards of each complete episode."""
+        """Return the sum of rewards for each complete episode."""
         return list(self._recorder.stats_recorder.episode_rewards)
 
     def get_episode_lengths(self) -> list[int]:
-        """Return the number of steps of each complete episode."""
+        """Return the number of steps in each complete episode."""
         return list(self._recorder.stats_recorder.episode_lengths)
 
     def model_changed(self) -> None:
-        """Report that a texture, height field or mesh changed during an episode.
+        """Declare that a texture, height field or mesh changed during an episode.
 
         Other visible changes, and all changes at a reset, are detected automatically.
-        The next recorded frame shows the change. Changed physical constants (masses,
+        The next recorded frame shows the change. Changes to physical constants (masses,
         damping) are then also stored in the trajectory, for replays.
         """
         self._recorder.model_changed()
 
     def forget_frames(self) -> None:
-        """Make the next episode look like the first one of a new environment.
+        """Make the next episode look like the first episode of a new environment.
 
         Gymnasium places its free camera at the first frame, and infinite planes and
-        tracking cameras depend on the previous frame. So the same episode can look
-        different as the first and as the tenth. Call this between two episodes. It has
-        no effect on live frames.
+        tracking cameras depend on the previous frame. So an episode can look different
+        depending on whether it is the first or the tenth. Call this between two
+        episodes. It does not affect live frames.
         """
         self._recorder.forget_frames()
 
     def _reset_by(self, reset: Callable[[], T]) -> T:
-        """Call the function that resets the environment, and note its exception."""
+        """Call the function that resets the environment, and record any exception."""
         try:
             with self._recorder.resetting():
                 return reset()
@@ -256,11 +256,11 @@ class EnvironmentMonitor(MonitorBase):
             env: the environment.
             directory: the monitor directory.
             options: the monitor's options.
-            scenes: returns the scenes for a camera and a size.
+            scenes: a function that returns the scenes for a camera and a size.
             view: the requested `camera` (or cameras), `height` and `width`.
-            close_environment: closes `env`.
-            rendering: creates the finisher that renders videos; if None, the monitor
-                has its own background finisher.
+            close_environment: a function that closes `env`.
+            rendering: a function that creates the finisher that renders videos; if
+                None, the monitor has its own background finisher.
             **subject: `env_id` and other arguments of `RecordedEnvironment`.
         """
         camera, size = view.get("camera"), {k: view.get(k) for k in ("height", "width")}
@@ -268,7 +268,7 @@ class EnvironmentMonitor(MonitorBase):
         known, *further = [scenes(camera=each, **size) for each in cameras]
         clip_states = None
         if options.has_clips:
-            # Clips overlap with episodes, and a source of states has only one reader.
+            # Clips overlap with episodes, and a state source allows only one reader.
             clip_states = scenes(camera=cameras[0], **size).states
         sources = [each.frames for each in (known, *further)]
         choice = rendering_choice(
@@ -362,7 +362,7 @@ def rendering_choice(
 
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:
-    """Call all functions, even if some raise; then raise the first exception."""
+    """Call all functions, even if some raise an exception; then raise the first one."""
     first: BaseException | None = None
     for call in calls:
         try:

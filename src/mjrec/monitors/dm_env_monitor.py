@@ -30,10 +30,10 @@ _NO_PHYSICS = (
 class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc]  # untyped
     """A monitor for a dm_env environment. Create it with `mjrec.Monitor`.
 
-    It follows dm_env's contract: `reset` is allowed at any time. A `step` before the
-    first reset or after the last time step ignores its action, starts an episode, and
-    is recorded as a reset. Other attributes of the environment (`physics`, `task`,
-    `control_timestep` ...) are available too.
+    It follows dm_env's contract: `reset` is allowed at any time, and a `step` before
+    the first reset or after the last time step ignores its action and starts an
+    episode. Such a step is recorded as a reset. Other attributes of the environment
+    (`physics`, `task`, `control_timestep` ...) are also available.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
 
@@ -162,7 +162,7 @@ def _scenes(env: dm_env.Environment, env_id: str | None, **view: Any) -> Scenes:
 def _env_id(env: dm_env.Environment) -> str:
     unknown = f"(unknown:{type(getattr(env, 'task', env)).__name__})"
     logger.warning(
-        "dm_env environments do not know their names, so the recordings say %s. To set "
+        "dm_env environments have no names, so the recordings say %s. To set "
         'the name, use Monitor(..., env_id="dm_control/cheetah-run").',
         unknown,
     )

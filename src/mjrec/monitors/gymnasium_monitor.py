@@ -30,10 +30,10 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
     """A monitor for a Gymnasium environment. Create it with `mjrec.Monitor`.
 
     An episode ends when it is terminated or truncated. A reset during an episode is an
-    error unless early resets are allowed. A step before the first reset or after the
-    end is always an error. A reset before any step keeps the episode's number and
-    replaces its first frame. With Gymnasium's `Autoreset` wrapper, the step after the
-    end is a reset and starts the next episode.
+    error unless early resets are allowed. A step before the first reset or after an
+    episode's end is always an error. A reset before any step keeps the episode's number
+    and replaces its first frame. With Gymnasium's `Autoreset` wrapper, the step after
+    an end is a reset and starts the next episode.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
     """
@@ -71,7 +71,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
     # Gymnasium's own wrappers also override the attribute with a property.
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The environment's own spec, which creates unmonitored environments."""
+        """The environment's own spec, which creates environments without monitors."""
         return self.env.spec
 
     def reset(
@@ -93,7 +93,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: there was no reset yet, or none since the end of an episode.
+            ResetNeeded: there has been no reset yet, or none since an episode ended.
         """
         recorder = self._recorder
         fast = recorder.fast
@@ -118,7 +118,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         return result
 
     def _before_step(self, action: Any) -> bool:
-        """Note an action; return whether the next step will be a reset instead."""
+        """Record an action; return whether the next step will be a reset instead."""
         if self._next_step_autoreset and self._recorder.done:
             self._recorder.before_reset()
             return True
@@ -140,7 +140,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         info: dict[str, Any],
         first_observation: Any = None,
     ) -> None:
-        """Record a step, and a reset if the step also was one.
+        """Record a step, and also a reset if the step included one.
 
         Args:
             observation: the step's observation.
@@ -178,7 +178,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
 
 
 def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
-    """Return the name in an environment's spec; `(unknown:ClassName)` without one."""
+    """Return an environment's name in its spec; `(unknown:ClassName)` without one."""
     if env.spec is not None:
         return env.spec.id
     unknown = f"(unknown:{type(env.unwrapped).__name__})"
@@ -191,11 +191,11 @@ def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
 
 
 def success_in(info: Mapping[str, Any]) -> bool | None:
-    """Return whether an episode was a success; None if unknown.
+    """Return whether an episode was successful; None if unknown.
 
     Args:
         info: the info of the episode's last step. `is_success` is used or, without it,
-            `success`: a bool, a number, or an array with one of these.
+            `success`: a bool, a number, or an array that contains one of these.
     """
     # Gymnasium-Robotics' Fetch and Hand environments use the first key; its Adroit and
     # maze environments, MetaWorld and others use the second.

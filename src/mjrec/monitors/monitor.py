@@ -67,9 +67,9 @@ def Monitor(  # noqa: N802  named like gym's class
             observation, info = env.reset(seed=0)
 
     If the state of a MuJoCo environment determines its frames, `step` only saves the
-    state, and worker processes render the frames, byte for byte as `env.render()` would
-    at that moment. Any recorded episode can be rerendered (`mjrec.render`). Other
-    environments are rendered in `step`, with their own `render()`.
+    state, and worker processes render frames that are byte-identical to those of
+    `env.render()`. Any recorded episode can be rerendered (`mjrec.render`). Other
+    environments are rendered during `step`, with their own `render()`.
 
     Args:
         env: a Gymnasium environment, a vector environment (see `VectorMonitor`), or a
@@ -84,18 +84,18 @@ def Monitor(  # noqa: N802  named like gym's class
         resume: add to existing recordings. Killed monitors are recovered first, as by
             `mjrec.recover`. Episode numbers continue from the highest number of all
             closed or dead monitors (with `uid`, only of those with this `uid`).
-            Monitors that use a directory at the same time all need `resume`, and number
+            Monitors that use a directory simultaneously all need `resume`, and number
             their episodes independently. `"join"` does not read other monitors' files,
             so it is fast even among thousands of monitors: it recovers nothing, numbers
             episodes from 0, and does not check that the environments are the same.
         write_upon_reset: write the statistics and manifest at every reset, not only at
-            the end. The journal always gets a line when an episode ends.
-        uid: used in file names instead of the process id.
+            the end. A line is always added to the journal when an episode ends.
+        uid: an id to use in file names instead of the process id.
         mode: type of the episodes, "training" or "evaluation".
         fps: frame rate of the video files. None means real time, one frame per step.
         camera: a camera's name or number, or a `mujoco.MjvCamera`. None means the
-            environment's own view. A list gives a video per camera:
-            `....video000027.mp4` for the first, `....video000027.<camera>.mp4` for the
+            environment's own view. A list yields one video per camera:
+            `....video000027.mp4` for the first, `....video000027.<camera>.mp4` for
             others. Live frames come from the environment's `render()`, so with
             `render="live"` a different camera or size is an error.
         width: width of the videos in pixels; if None, the environment's own.
@@ -107,15 +107,15 @@ def Monitor(  # noqa: N802  named like gym's class
         render: "deferred" (save states now, render later), "live" (render in `step`),
             "off" (only statistics and trajectories), or None: deferred if the states
             are known to determine the frames, otherwise live. The log and the metadata
-            name the mode and the reason.
+            state the mode and the reason.
         workers: number of processes that render deferred frames. None means one per
             usable CPU, shared by all monitors of a directory. 0 renders nothing now and
             leaves the videos pending for `mjrec render DIR`.
         trajectory_callable: a function that takes an episode number and returns whether
             the trajectory is kept. True keeps all. False keeps none, and a video's
             trajectory is removed once the video exists. None keeps those of evaluation
-            episodes and of episodes with a video.
-        observations: record observations in trajectories too.
+            episodes and episodes with a video.
+        observations: also record observations in trajectories.
         allow_early_reset: allow resets during an episode. An interrupted episode is not
             included in the statistics, and its video is marked incomplete. None follows
             the framework: not allowed for Gymnasium, allowed for its vector
@@ -125,9 +125,9 @@ def Monitor(  # noqa: N802  named like gym's class
             warning, and `mjrec.faults` in the manifest lists what is missing. Errors in
             the environment, incorrect calls, and a `close()` that cannot write results
             always raise.
-        strict: treat a video that shows nothing (black, one colour, no movement) as an
-            error: `BlankVideo` at the end of its episode or, for a deferred video,
-            `RenderError` in `close`. In any case the video is kept, its metadata has
+        strict: treat a blank video (black, one color, no movement) as an error:
+            `BlankVideo` at the end of its episode or, for a deferred video,
+            `RenderError` in `close`. In any case, the video is kept, its metadata has
             `suspect_black` or `suspect_constant`, and the log has a warning.
         keep: choose the videos after episodes have ended, instead of with
             `video_callable`: "best:3" or "worst:3" (by return), "failures" or
@@ -138,30 +138,30 @@ def Monitor(  # noqa: N802  named like gym's class
             its last step or, without either, if it terminated. Other episodes are
             deleted as soon as the rule allows; "median" and functions keep all states
             on disk until `close`. Incomplete episodes are never chosen. Trajectories
-            that are kept for another reason remain, without their video. The manifest
-            and metadata name the rule. After a kill, all candidates are pending. If the
-            function raises or names unknown episodes, `close` reports it and keeps all.
+            kept for another reason remain, without their video. The manifest and
+            metadata state the rule. After a kill, all candidates are pending. If the
+            function fails or names unknown episodes, `close` reports it and keeps all.
         step_trigger: a function that is called before each step with the number of
             steps so far, and returns whether a clip starts. Replaces `video_callable`.
-            A clip's first frame is the one before the step.
+            A clip's first frame is the frame before the step.
         video_length: number of steps in a clip after its first frame, across resets.
             None means until the end of the episode.
         name_prefix: also link finished videos under Gymnasium's names:
             `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`.
         episode_info: add `info["episode"]` to the last step of an episode: return "r",
-            length "l" and seconds "t", as Gymnasium's RecordEpisodeStatistics does. An
+            length "l" and seconds "t", like Gymnasium's RecordEpisodeStatistics. An
             existing key is kept. Gymnasium environments only.
         annotate: write episode, step, simulated time and return on the frames, which
             then differ from those of `env.render()`.
         tiled: record one video with all cameras side by side, instead of one per
             camera. For a vector environment, also record a video of all
             sub-environments side by side.
-        trackers: trackers to notify of finished episodes and videos, see
+        trackers: trackers to notify of finished episodes and videos; see
             `mjrec.trackers`.
         policy_file: the policy's file, such as a checkpoint. Its SHA-256 is stored in
             the manifest, as evidence.
         env_id: the environment's name in the recordings. None means the name in its
-            spec. dm_env environments have no spec, so give a name:
+            spec. dm_env environments have no spec, so pass a name:
             `dm_control/<domain>-<task>`.
 
     Returns:
@@ -177,8 +177,8 @@ def Monitor(  # noqa: N802  named like gym's class
         ExistingRecordings: the directory contains recordings, and neither `force` nor
             `resume` was given.
         DirectoryInUse: `force` was given, but another monitor is recording there.
-        DifferentEnvironment: `resume` was given, but the recordings are of a different
-            environment.
+        DifferentEnvironment: `resume` was given, but the recordings are from a
+            different environment.
         DirectoryNotWritable: the directory cannot be created or written to.
 
     If an error is raised, `env` is unchanged and no files are left.
@@ -195,7 +195,7 @@ def Monitor(  # noqa: N802  named like gym's class
 def monitored(
     env: Any, directory: str | os.PathLike[str], options: RecorderOptions, **view: Any
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
-    """Create a monitor, as `Monitor` does, from an options object.
+    """Create a monitor like `Monitor`, but from an options object.
 
     Args:
         env: see `Monitor`.

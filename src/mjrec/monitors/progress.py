@@ -23,20 +23,20 @@ ShowProgress: TypeAlias = Callable[[str, int, int | None, str], None]
 
 logger = logging.getLogger(__name__)
 
-# Seconds until a log's first line about rendering, and between further lines.
+# Seconds before a log's first line about rendering, and between later lines.
 _FIRST_LINE_S = 5.0
 _LINES_EVERY_S = 30.0
 
 
 @contextlib.contextmanager
 def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowProgress]:
-    """Yield a function that shows a progress bar for each operation it is called with.
+    """Yield a function that shows a progress bar for each operation passed to it.
 
     The bars are removed at the end, so they do not remain in the program's output.
 
     Args:
-        console: the console to use; if None, standard error. Lines printed to it in the
-            meantime appear above the bars.
+        console: the console to use; if None, standard error. Lines printed to the
+            console in the meantime appear above the bars.
     """
     if not _is_terminal(console):
         yield lambda what, done, total, words: None
@@ -75,7 +75,7 @@ def render_progress(
 ) -> Iterator[Callable[[Progress], None]]:
     """Yield a function that shows the progress of rendering.
 
-    Without a terminal it writes a line after five seconds, and then every 30.
+    Without a terminal, it writes a line after 5 seconds, and then one every 30 seconds.
 
     Args:
         console: see `progress_bar`.

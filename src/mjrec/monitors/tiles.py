@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiled videos of all sub-environments of a vector environment, side by side."""
+"""Tiled videos, which show cameras or sub-environments side by side."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
     cameras = list(camera) if _are_several(camera) else [camera]
     if not cameras:
         raise InvalidArgument(
-            "camera=[] contains no camera: name one or more, or give None for the "
+            "camera=[] contains no camera. Pass one or more, or None for the "
             "environment's own view."
         )
     plain = _plain(cameras)
@@ -56,7 +56,7 @@ def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
         raise InvalidArgument(
             "tiled=True puts the frames of several cameras, or of a vector "
             "environment's sub-environments, side by side, but there is only one "
-            f"of each: got the camera {camera!r}. Give several cameras."
+            f"of each (camera={camera!r}). Pass several cameras."
         )
     return cameras
 
@@ -64,7 +64,7 @@ def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
 def camera_frames(
     cameras: Sequence[Any], sources: Sequence[EpisodeFrames], *, tiled: bool
 ) -> dict[str, Any]:
-    """Return the arguments for `RecordedEnvironment` about the frames of cameras.
+    """Return the `RecordedEnvironment` arguments for the frames of cameras.
 
     These are `frames` and, with several cameras, `cameras` and `further_frames` (only
     if the frames exist and are not tiled).
@@ -80,7 +80,7 @@ def camera_frames(
     view: dict[str, Any] = {"frames": sources[0], "cameras": plain}
     without = [source for source in sources if not can_give_frames(source)]
     if without:
-        # Either all are rendered by workers or none is.
+        # Either all are rendered by workers, or none are.
         view["frames"] = without[0]
     elif tiled:
         view["frames"] = Tiles(sources, are_cameras=True)
@@ -116,7 +116,7 @@ class Tiles:
 
     Args:
         sources: the sources of the frames.
-        are_cameras: whether they are several cameras of one environment.
+        are_cameras: whether the sources are several cameras in one environment.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Tiles:
 
     @property
     def render_mode(self) -> str | None:
-        """`rgb_array` if all sources have it, otherwise None."""
+        """`rgb_array` if all sources have that mode, otherwise None."""
         modes = {source.render_mode for source in self.sources}
         return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
 
@@ -134,7 +134,7 @@ class Tiles:
         """Return the current frame.
 
         Raises:
-            InvalidArgument: the frames differ in size, or one is not a valid frame.
+            InvalidArgument: the frames differ in size, or a frame is invalid.
         """
         return grid_frame([check_frame(source.render()) for source in self.sources])
 
@@ -157,7 +157,7 @@ def has_videos(options: RecorderOptions) -> bool:
 def vector_tiles(
     envs: Sequence[Any], options: RecorderOptions, view: Mapping[str, Any]
 ) -> Tiles | None:
-    """Return the frames of tiled videos of sub-environments; None without such videos.
+    """Return the frames for tiled videos of sub-environments; None without such videos.
 
     Args:
         envs: the sub-environments.
@@ -192,7 +192,7 @@ def vector_tiles(
 
 
 class TiledVideo:
-    """A recorder of all sub-environments during the first one's scheduled episodes.
+    """A recorder for all sub-environments during the first one's scheduled episodes.
 
     Args:
         first: the recorder of the first sub-environment, whose manifest lists the
@@ -210,7 +210,7 @@ class TiledVideo:
         self._ending: dict[str, Any] | None = None
 
     def take_last(self) -> None:
-        """Take the frame of the last step, if it was left out."""
+        """Take the frame of the last step if it was skipped."""
         if self._live is not None and self._ending is None:
             self._live.take_last()
 
@@ -235,7 +235,7 @@ class TiledVideo:
 
         Args:
             terminated: whether the task ended the first sub-environment's episode.
-            truncated: whether a limit outside the task ended it.
+            truncated: whether a limit outside the task ended that episode.
 
         Returns:
             Whether a video is being recorded.
@@ -260,7 +260,7 @@ class TiledVideo:
         return self._live is not None
 
     def note_error(self, error: BaseException) -> None:
-        """Note an exception, which marks the video if nothing is recorded after it."""
+        """Record an exception, which marks the video if nothing is recorded later."""
         if self._ending is None:
             self._ending = ending(error)
 

@@ -58,21 +58,21 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
     in every autoreset mode, rendered from states if possible. Rewards and actions are
     those of the sub-environment, not of vector wrappers.
 
-    Others (`AsyncVectorEnv`, vectorized simulators) are recorded from outside: frames
-    are rendered live, with `render()`, and trajectories have no states. If such an
-    environment resets itself in the step that ends an episode (SAME_STEP), the last
-    frame is missing, and the metadata says `final_frame: missing`. To avoid this, put a
-    Monitor inside the environment functions.
+    Other sub-environments (`AsyncVectorEnv`, vectorized simulators) are recorded from
+    outside: frames are rendered live, with `render()`, and trajectories have no states.
+    If such an environment resets itself in the step that ends an episode (SAME_STEP),
+    the last frame is missing, and the metadata says `final_frame: missing`. To avoid
+    this, put a Monitor inside the functions that create the environments.
 
     A reset during an episode is allowed unless `allow_early_reset=False`, because
     sub-environments end their episodes at different times. Interrupted episodes are not
     included in the statistics.
 
     `tiled=True` adds a video of all sub-environments side by side,
-    `....video000027.tiled.mp4`, for the scheduled episodes of the first one. It is
-    rendered live and needs `render_mode="rgb_array"`. In the SAME_STEP mode, its last
-    frame shows the first sub-environment after the reset, and its metadata says
-    `final_frame: missing`.
+    `....video000027.tiled.mp4`, for the scheduled episodes of the first
+    sub-environment. It is rendered live and needs `render_mode="rgb_array"`. In the
+    SAME_STEP mode, its last frame shows the first sub-environment after the reset, and
+    its metadata says `final_frame: missing`.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
 
@@ -110,7 +110,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             shared = Background(
                 directory, workers=options.workers, strict=options.strict
             )
-        # Closes a sub-environment; does nothing until all of them have monitors.
+        # Closes a sub-environment, but does nothing until all of them have monitors.
         closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
         self.monitors: tuple[GymnasiumMonitor, ...] = _all_or_none(
             directory,
@@ -194,8 +194,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: there was no reset yet, or a sub-environment's episode is over
-                and was not reset.
+            ResetNeeded: there has been no reset yet, or a sub-environment has not been
+                reset since its episode ended.
         """
         if self._is_closed:
             return self.env.step(actions)
@@ -226,7 +226,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         super().close(wait=wait)
 
     def __del__(self) -> None:
-        # Gymnasium 1.0 would call `close`, which waits. The guard closes it instead.
+        # Gymnasium 1.0 would call `close`, which waits. Use the guard instead.
         pass
 
     @property
@@ -328,7 +328,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         return list(gymnasium.vector.utils.iterate(space, observations))
 
     def _check_reset(self, which: list[int]) -> None:
-        """Check, before anything is reset, that all these resets are allowed."""
+        """Check before the reset that all of these resets are allowed."""
         if self._options.allow_early_reset or self._had_error:
             return
         stats = [recorder.stats_recorder for recorder in self._recorders]
@@ -376,14 +376,14 @@ def _seed_of(env: VectorEnv, index: int, seed: Any) -> Any:
         return seed[index]
     if isinstance(seed, int) and is_async(env):
         return seed + index
-    # All sub-environments share one generator, seeded with the vector environment's.
+    # All sub-environments share one generator, seeded by the vector environment.
     return seed
 
 
 def _add_episode_info(
     infos: dict[str, Any], last_infos: Mapping[int, Mapping[str, Any]], ends: Any
 ) -> None:
-    """Add the info about ended episodes that Gymnasium's own wrapper would add."""
+    """Add the info that Gymnasium's own wrapper would add about ended episodes."""
     if not last_infos:
         return
     zeros = {"r": 0.0, "l": 0, "t": 0.0}
@@ -404,17 +404,17 @@ def _options_of(
 ) -> RecorderOptions:
     """Return the options of one sub-environment's monitor.
 
-    The first one opens the directory as requested, and the others join it.
+    The first monitor opens the directory as requested, and the others join it.
     """
     changed: dict[str, Any] = {
-        # With several cameras, each sub-environment has its own tiled video of them.
+        # With several cameras, each sub-environment has its own tiled video.
         "tiled": options.tiled and isinstance(view.get("camera"), list | tuple),
         "tail_bytes": min(options.tail_bytes, _TAILS // count),
     }
     if index > 0:
         changed |= {"force": False, "resume": options.resume or True}
     if options.name_prefix is not None:
-        # With the same prefix, all would use the same file names.
+        # With the same prefix, all monitors would use the same file names.
         changed["name_prefix"] = f"{options.name_prefix}-env-{index}"
     return dataclasses.replace(options, **changed)
 
@@ -422,7 +422,7 @@ def _options_of(
 def _all_or_none(
     directory: str | os.PathLike[str], opens: Iterable[Callable[[], GymnasiumMonitor]]
 ) -> tuple[GymnasiumMonitor, ...]:
-    """Return the monitors that the functions open; undo everything if one fails.
+    """Return the monitors that the functions open. If one fails, undo everything.
 
     This removes their files and the directories created for them.
     """
@@ -457,6 +457,6 @@ def _warn_of_missing_frames(env: VectorEnv, is_outside: bool, is_tiled: bool) ->
     if is_tiled:
         logger.warning(
             "The last frame of each tiled video shows the first sub-environment, and "
-            "any others whose episode has ended, after the reset: with SAME_STEP, all "
-            "can be rendered together only then."
+            "any others whose episode has ended, after the reset. With SAME_STEP, all "
+            "sub-environments can be rendered together only then."
         )

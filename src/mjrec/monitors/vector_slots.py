@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The individual sub-environments of a vector environment.
+"""The individual sub-environments in a vector environment.
 
 Sub-environments that are objects in this process are in the vector environment's list.
-All others are visible only from outside: each is a slot in the inputs and outputs of
-the vector environment.
+All others are visible only from outside, as slots in the inputs and outputs of the
+vector environment.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def autoreset_mode(env: VectorEnv) -> str:
     """Return the autoreset mode: `DISABLED`, `NEXT_STEP` or `SAME_STEP`.
 
     Raises:
-        InvalidArgument: the vector environment does not name its mode.
+        InvalidArgument: the vector environment does not declare its mode.
     """
     mode = (env.metadata or {}).get("autoreset_mode")
     # Gymnasium 1.0 has no modes: its vector environments reset in the step after the
@@ -58,7 +58,7 @@ def autoreset_mode(env: VectorEnv) -> str:
 
 
 def environments_inside(env: VectorEnv) -> list[Env] | None:
-    """Return a vector environment's own list of its sub-environments.
+    """Return a vector environment's own list of sub-environments.
 
     The result is None if they are not objects in this process.
     """
@@ -79,7 +79,7 @@ def common_env_id(envs: Sequence[Env]) -> str:
         names = ", ".join(sorted(str(name) for name in ids))
         raise InvalidArgument(
             f"The sub-environments have different names: {names}. All results in one "
-            "directory must belong to one environment: set a common name with env_id=, "
+            "directory must belong to one environment. Set a common name with env_id=, "
             "or put Monitor around each of them, with separate directories."
         )
     return env_id_of(envs[0])
@@ -122,8 +122,8 @@ class Frames:
 class SubEnvironment(Env):
     """A stand-in for a sub-environment that is visible only from outside.
 
-    Its monitor gets the inputs and outputs of the vector environment, and calls only
-    `render`.
+    Its monitor receives the inputs and outputs of the vector environment, and calls
+    only `render`.
     """
 
     control_timestep: Callable[[], float] | None = None
@@ -159,7 +159,7 @@ def slots_outside(env: VectorEnv, frames: Frames) -> list[SubEnvironment]:
 
 
 def check_outside(env: VectorEnv, asked: str | None, view: Mapping[str, Any]) -> None:
-    """Check that no option needs sub-environments that are objects in this process.
+    """Check that no option requires sub-environments that are objects in this process.
 
     Args:
         env: the vector environment.
@@ -205,7 +205,7 @@ def env_id_outside(env: VectorEnv) -> str:
 
 
 def way_out(env: VectorEnv) -> str:
-    """Return advice on how to record states and all frames anyway."""
+    """Return advice on how to record the states and all frames."""
     if is_async(env):
         return (
             "Put Monitor around each of them, inside the functions that create them: "
@@ -227,7 +227,7 @@ def is_async(env: VectorEnv) -> bool:
 def _timesteps(env: VectorEnv) -> Sequence[float | None]:
     """Return each sub-environment's seconds per step; None if unknown."""
     base: Any = env.unwrapped
-    # Asking another process for a missing attribute would end that process.
+    # Requesting a missing attribute from another process would end that process.
     if is_async(env) and all(
         all(base.call("has_wrapper_attr", name)) for name in ("model", "data", "dt")
     ):

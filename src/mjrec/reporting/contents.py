@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contents of a report, which `gathering` collects and `page` shows.
 
-All strings may come from untrusted files. Code that writes them into a page must escape
-them.
+All strings may come from untrusted files. Code that writes these strings into a page
+must escape them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..evaluation.summaries import (
 )
 from ..results.episodes import Episode
 
-# An episode's outcome: this, or a sum of 1 (terminated) and 2 (truncated).
+# An episode's outcome is this value, or a sum of 1 (terminated) and 2 (truncated).
 FAILED: Final = 4
 
 ROLES: Final = ("best", "median", "worst")
@@ -37,30 +37,30 @@ _NO_MONITOR: Final = -2
 
 @dataclass(kw_only=True)
 class ReportVideo:
-    """A video of the gallery.
+    """A video in the gallery.
 
     Attributes:
         path: the recorded file.
-        infix: the infix of the monitor that recorded it.
-        episode_id: the number, in its monitor, of the one episode that it shows. None
-            if it shows several, or if the number is unknown.
+        infix: the infix of the monitor that recorded the video.
+        episode_id: the number, in its monitor, of the video's episode. None if it shows
+            several episodes, or if the number is unknown.
         index: the index of that episode in `ReportTask.episodes`; None if unknown.
         file: the address of the copy relative to the page, or a `data:` URL; empty if
             the video is not part of the report.
         image: a still image, as a JPEG; None if there is none.
-        poster: the address of that image, in the same form as `file`.
-        roles: which of `"best"`, `"median"`, `"worst"` its episode is.
+        poster: the address of the still image, in the same form as `file`.
+        roles: the roles of its episode: `"best"`, `"median"`, `"worst"`.
         height: height of the frames in pixels; None if unknown.
         width: width of the frames in pixels; None if unknown.
         seconds: duration in seconds; None if unknown.
         camera: a description of the camera; None if unknown.
-        renderer: the OpenGL renderer that drew it; None if unknown.
+        renderer: the OpenGL renderer that drew the video; None if unknown.
         sha256: the SHA-256 of the file; None if the metadata lacks it.
         command: the shell command that rerenders it; None without recorded states.
         notes: remarks, for example that the video is incomplete.
-        trajectory: the file of the recorded states; None if there are none.
-        replay: the address of its 3D page, relative to the report's; empty if there is
-            none.
+        trajectory: the file with the recorded states; None if there are none.
+        replay: the address of the 3D page, relative to the report's page; empty if
+            there is none.
     """
 
     path: Path
@@ -85,23 +85,23 @@ class ReportVideo:
 
 @dataclass(kw_only=True)
 class ReportTask:
-    """A task of an evaluation, or an environment of a monitor directory.
+    """A task in an evaluation, or an environment in a monitor directory.
 
     Attributes:
-        name: its name on the page, followed by the directory if several tasks have the
-            same name.
+        name: the task's name on the page, followed by the directory if several tasks
+            have the same name.
         source: the directory, as given.
-        is_evaluation: whether the episodes are those of an evaluation, whose runs are
-            seeds. Otherwise they come from monitors, in order of time, as in training.
-        summary: the summary of its episodes.
-        episodes: `(n,)` of dtype `ROW`, so that a million of them need little memory.
-            For monitors, `seed` is the index into `runs`, and `start_time` is the time
-            of the end.
-        runs: the names of the runs, if they are monitors.
-        failures: the reasons why episodes failed, by index.
-        videos: its videos, in the order of their episodes.
-        provenance: pairs of label and value, for people: versions, GL renderer, policy,
-            seeds, selection rule, protocol ...
+        is_evaluation: whether the episodes are from an evaluation, whose runs are
+            seeds. If not, they are from monitors, in order of time, as in training.
+        summary: the summary of the episodes.
+        episodes: `(n,)` of dtype `ROW`, so that a million episodes need little memory.
+            For monitors, `seed` is the index into `runs`, and `start_time` is the end
+            time.
+        runs: the names of the runs if they are monitors.
+        failures: the reasons why episodes failed, keyed by index.
+        videos: the videos, in the order of their episodes.
+        provenance: human-readable pairs of label and value: versions, GL renderer,
+            policy, seeds, selection rule, protocol ...
     """
 
     name: str
@@ -117,14 +117,14 @@ class ReportTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """A verdict of `mjrec verify --json` about recordings.
+    """A verdict on recordings from `mjrec verify --json`.
 
     Attributes:
         source: the path that was verified, and the file with the verdict.
         verdict: `PASS`, `PARTLY` or `FAIL`.
         counts: number of findings by outcome: recreated, within tolerance, believed,
             different.
-        level: the level of the verification.
+        level: the verification level.
     """
 
     source: str
@@ -139,11 +139,11 @@ class ReportContents:
 
     Attributes:
         title: the page's title.
-        tasks: the tasks, in the order of the page.
-        across: the statistics across tasks of each evaluation, by directory.
-        bootstrap: the settings for intervals.
-        problems: sentences about things that could not be read or shown.
-        verdicts: the verdicts of verifications.
+        tasks: the tasks, in the order used on the page.
+        across: for each evaluation, the statistics across tasks, keyed by directory.
+        bootstrap: the settings for the intervals.
+        problems: sentences about items that could not be read or shown.
+        verdicts: the verdicts from verifications.
     """
 
     title: str = ""
@@ -163,7 +163,7 @@ def rows_of_monitor(episodes: Iterable[Episode], *, run: int) -> NDArray[np.void
     """Return a monitor's episodes as rows.
 
     Args:
-        episodes: the episodes, which are read one at a time and not kept.
+        episodes: the episodes, which are read one by one and not kept.
         run: the monitor's index.
     """
 
@@ -171,7 +171,7 @@ def rows_of_monitor(episodes: Iterable[Episode], *, run: int) -> NDArray[np.void
         number, truths = episode.episode_id, []
         for truth in (episode.terminated, episode.truncated, episode.success):
             truths.append(-1 if truth is None else int(truth))
-        # An episode whose number is uncertain has no files, and gets no video.
+        # An episode with an uncertain number has no files, so it gets no video.
         has_files = episode.video or episode.metadata or episode.trajectory
         figures = run, number, episode.reward, episode.length, *truths
         return *figures, episode.end_time, 0.0, run, number if has_files else -1
@@ -180,9 +180,9 @@ def rows_of_monitor(episodes: Iterable[Episode], *, run: int) -> NDArray[np.void
 
 
 def in_time(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """Return episodes of monitors in the order in which they ended.
+    """Return monitors' episodes in the order in which they ended.
 
-    Episodes that ended at the same time keep their order. Those without a time come
+    Episodes that ended at the same time keep their order. Episodes without a time come
     last.
     """
     rows = rows[np.argsort(end_times(rows), kind="stable")]
@@ -212,7 +212,7 @@ def find_episodes(
     Args:
         videos: the videos.
         rows: the episodes.
-        monitors: the infixes of the monitors that recorded them.
+        monitors: the infixes of the monitors that recorded the episodes.
     """
     number = {infix: index for index, infix in enumerate(monitors)}
     for video in videos:
@@ -224,7 +224,7 @@ def find_episodes(
 def summary_of_rows(
     name: str, rows: NDArray[np.void], *, bootstrap: Bootstrap
 ) -> TaskSummary:
-    """Return the summary of episodes that monitors recorded, without failed ones.
+    """Return the summary of episodes that monitors recorded, excluding failed ones.
 
     Args:
         name: the environment's name.
@@ -246,9 +246,9 @@ def summary_of_rows(
 
 
 def episodes_with_roles(task: ReportTask) -> dict[int, tuple[str, ...]]:
-    """Return the roles of the best, the median and the worst episode, by index.
+    """Return the roles of the best, median and worst episodes, keyed by index.
 
-    Among equal returns, the first episode counts. The median of an even number is the
+    Ties go to the first episode. For an even number of episodes, the median is the
     lower one. NaN is the worst return. Failed episodes have no role.
     """
     completed = np.delete(np.arange(len(task.episodes)), list(task.failures))

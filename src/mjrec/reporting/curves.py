@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SVG figures for a report's page, in the page's colours.
+"""SVG figures for a report's page, drawn in the page's colors.
 
-Each function returns one `<svg>` element for an HTML page. Instead of colours it has
-classes (`f-` for fills, `s-` for strokes, such as `s-accent`), so that one figure works
-in light mode, dark mode and print. It has no `style` attributes, which a strict content
-security policy would block, and no external references. It contains a title and a
-description in words. The same input gives the same bytes.
+Each function returns one `<svg>` element for an HTML page. The element uses classes
+instead of colors (`f-` for fills, `s-` for strokes, such as `s-accent`), so that one
+figure works in light mode, dark mode and print. It has no `style` attributes, which a
+strict content security policy would block, and no external references. It contains a
+title and a description in words. The same input yields the same bytes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .page_text import decimals_for, interval_text, number
 _Floats: TypeAlias = NDArray[np.float64]
 _Ticks: TypeAlias = Sequence[tuple[float, str]]
 
-# The number of classes that distinguish lines. Each also has its own dash pattern.
+# The number of classes that distinguish lines. Each class also has a dash pattern.
 SERIES: Final = 6
 
 # Width and height in SVG units (CSS pixels if there is room); small enough for a phone.
@@ -35,24 +35,24 @@ _WIDE: Final = (520, 260)
 _TOP: Final = 24
 _BELOW: Final = 38
 
-# More could not be told apart, and would be slow to lay out.
+# More elements would be indistinguishable and slow to lay out.
 _MOST_DOTS: Final = 600
 _MOST_POINTS: Final = 160
 _MOST_COLUMNS: Final = 40
-# From a longer window, only this many episodes are used, evenly spaced.
+# For a longer window, only this many evenly spaced episodes are used.
 _WIDEST_WINDOW: Final = 1000
 _LARGEST: Final = 1e300
 _SMALLEST: Final = 1e-300
 
 
 def learning_curve(task: ReportTask, *, key: str) -> str:
-    """Return a figure of returns over episodes: the running mean and the spread.
+    """Return a figure of returns over episodes, with the running mean and the spread.
 
-    Episodes are in the order in which they ended, if that is known for all, otherwise
-    in the order of the task. They are numbered from 0. If they are few, each has a dot.
+    Episodes are in the order in which they ended if all end times are known, otherwise
+    in the task's order. They are numbered from 0. If there are few, each has a dot.
 
     Args:
-        task: a task with episodes of monitors, such as a training run.
+        task: a task with episodes from monitors, such as a training run.
         key: a prefix that makes the figure's element ids unique on the page.
     """
     _, returns, times = _drawable(task)
@@ -61,7 +61,7 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     count, window = len(returns), max(5, len(returns) // 20)
     middle, low, mean, high = _running(returns, window)
     has_dots = count <= _MOST_DOTS
-    # The axis need not fit dots that are not drawn.
+    # The axis need not include dots that are not drawn.
     y = _span(returns if has_dots else np.append(low, high))
     panel = _Panel(46, _SMALL[0] - 14, x=_span([0, count - 1], margin=0.01), y=y)
     if has_dots:
@@ -82,14 +82,14 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
 
 
 def evaluation_curve(task: ReportTask, *, key: str) -> str:
-    """Return a figure of an evaluation's returns, by seed and by share reached.
+    """Return a figure of an evaluation's returns by seed and of their distribution.
 
     On the left, each episode is a dot above its seed, each seed's mean is a short line,
     and the overall mean is a long line with its interval. On the right, a curve shows
     the share of episodes that reach each return.
 
     Args:
-        task: a task of an evaluation.
+        task: a task in an evaluation.
         key: a prefix that makes the figure's element ids unique on the page.
     """
     runs, returns, _ = _drawable(task)
@@ -112,7 +112,7 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     named = _spread(len(seeds), 6 if longest < 4 else 2)
     dots.label("Return", "Seed", [(i, str(seeds[i])) for i in named])
     shares = _Panel(228, 318, x=(0, 1), y=reach, y_labels=False)
-    # The corners of a step curve: shares of the episodes, and the returns they reach.
+    # The corners of a step curve: shares of episodes, and the returns they reach.
     heights = np.sort(returns)[::-1][_spread(len(returns), _MOST_POINTS)]
     edges = np.linspace(0, 1, len(heights) + 1)
     shares.line(np.repeat(edges, 2)[1:-1], np.repeat(heights, 2), "accent")
@@ -126,14 +126,14 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
 
 
 def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
-    """Return a figure of performance profiles, each a line with a band.
+    """Return a figure that shows performance profiles, each as a line with a band.
 
     A profile is the share of scores above a threshold, as a function of the threshold.
     Line i has the class `s-series-<i>`, modulo `SERIES`; the page has the legend.
 
     Args:
-        across: the statistics across tasks of each evaluation. Those without a profile
-            are not drawn, but still counted in i.
+        across: the statistics across tasks of each evaluation. Evaluations without a
+            profile are not drawn, but are still counted in i.
         key: a prefix that makes the figure's element ids unique on the page.
     """
     profiles = [each.profile for each in across.values()]
@@ -161,9 +161,9 @@ def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
 
 
 def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
-    """Return the runs, returns and end times of episodes with a finite return.
+    """Return the runs, returns and end times of the episodes with finite returns.
 
-    Returns are clipped so that their sums are finite, too.
+    Returns are clipped so that their sums are also finite.
     """
     known = task.episodes[np.isfinite(task.episodes["total_reward"])]
     returns = np.clip(known["total_reward"], -_LARGEST, _LARGEST)
@@ -173,7 +173,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
 def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
-    """Return the centres of running windows, and their 10%, mean and 90% values."""
+    """Return the centers of running windows, and their 10%, mean and 90% values."""
     count = max(0, len(returns) - window + 1)
     if not count:
         return (np.empty(0),) * 4
@@ -194,7 +194,7 @@ def _spread(count: int, most: int) -> NDArray[np.intp]:
 def _draw_seeds(
     panel: _Panel, returns: _Floats, place: NDArray[np.intp], seeds: int
 ) -> None:
-    """Draw each seed's episodes from left to right in its column, and their mean."""
+    """Draw each seed's episodes from left to right in one column, and their mean."""
     for seed in range(seeds):
         of_seed = returns[place == seed]
         chosen = _spread(len(of_seed), max(20, _MOST_DOTS // seeds))
@@ -237,7 +237,7 @@ def _short(value: float) -> str:
 
 
 class _Panel:
-    """A part of a figure with its own scales, and grid lines at the ticks of y.
+    """A part of a figure with its own scales, and with grid lines at the y ticks.
 
     Args:
         left: the panel's left edge, in pixels from the figure's left edge.
@@ -245,8 +245,8 @@ class _Panel:
         height: the figure's height in pixels.
         x: the range of the x axis.
         y: the range of the y axis.
-        ticks: the ticks of y with their labels; by default chosen automatically.
-        y_labels: whether the labels of y are written.
+        ticks: the y ticks with their labels; chosen automatically by default.
+        y_labels: whether to draw the labels of the y ticks.
     """
 
     def __init__(
@@ -270,12 +270,12 @@ class _Panel:
             self._text(left - 7, pixel + 4, label if y_labels else "", anchor="end")
 
     def label(self, up: str, right: str, ticks: _Ticks) -> None:
-        """Write the labels of the axes, and the ticks of x.
+        """Draw the axis labels and the x ticks.
 
         Args:
-            up: the label of y, above the panel.
-            right: the label of x, below the panel.
-            ticks: the ticks of x with their labels.
+            up: the label of the y axis, above the panel.
+            right: the label of the x axis, below the panel.
+            ticks: the x ticks with their labels.
         """
         for value, label in ticks:
             ((x, _),) = self._pixels([value], [self._y[0]])
@@ -330,7 +330,7 @@ class _Panel:
 
 
 def _joined(points: Sequence[Sequence[float]]) -> str:
-    """Return the data of a path through points; empty if there are none."""
+    """Return the data for a path through points; empty without points."""
     joined = "L".join(f"{x:g} {y:g}" for x, y in points)
     return f"M{joined}" if joined else ""
 

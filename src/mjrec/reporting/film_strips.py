@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film strips for papers: frames of an episode, each with its time.
 
-Frames come from a video, or from a recorded trajectory, which is rendered again and
-gives sharper frames of any size. Pillow, an optional package, writes the times. It is
-imported only when a strip is made.
+Frames come from a video, or from a recorded trajectory, which is rerendered and yields
+sharper frames of any size. Pillow, an optional package, draws the times. It is imported
+only when a strip is created.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TRAJECTORY: Final = ".h5"
 _SIZE: Final = ("height", "width")
 _MOST_IN_A_ROW: Final = 8
 _DOTS_PER_INCH: Final = 300
-# Pixels of a whole strip. At twice as many, Pillow suspects an attack.
+# Maximum number of pixels in a strip. At twice this number, Pillow raises an error.
 _MOST_PIXELS: Final = 1 << 27
 
 _INK: Final = (32, 32, 32)
@@ -61,7 +61,7 @@ def film_strip(
     """Return frames of an episode side by side on white, with their times.
 
     Frames are evenly spaced, including the first and the last. Times are simulated
-    seconds since the reset if known, otherwise the video's own times.
+    seconds since the reset if known, otherwise times in the video.
 
     Args:
         file: a trajectory (`.h5`), which is rendered, or a video, which is decoded.
@@ -93,7 +93,7 @@ def film_strip(
         if any(option is not None for option in (camera, height, width, quality)):
             raise InvalidArgument(
                 f"{path} is a video, so camera, size and quality cannot be changed. To "
-                "change them, give the trajectory instead "
+                "change them, pass the trajectory instead "
                 "(openaigym.trajectory.*.h5)."
             )
         return _laid_out(*_of_video(path, frames), columns)
@@ -139,7 +139,7 @@ def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]
     height, width = stream.height, stream.width
     with contextlib.suppress(OSError, ValueError):
         metadata = read_object(metadata_path(path))
-        # The size before the encoder's padding to even numbers.
+        # The size before the encoder padded it to even numbers.
         own_height, own_width = (field(metadata, key, integer) for key in _SIZE)
         simulated = _simulated_times(metadata)
         if 0 <= height - own_height <= 1 and 0 <= width - own_width <= 1:
@@ -162,7 +162,7 @@ def _simulated_times(metadata: Any) -> Sequence[float]:
     steps = itertools.chain.from_iterable(
         range(first, last + 1, stride) for first, last in runs
     )
-    # Limited to the number of frames, whatever the runs claim.
+    # Limited to the number of frames, regardless of the claimed runs.
     known = list(itertools.islice(steps, count + 1))
     return [float(step * timestep) for step in known] if len(known) == count else []
 
@@ -192,7 +192,7 @@ def _check_count(name: str, count: object) -> None:
 def _laid_out(
     frames: Iterator[Frame], times: Sequence[float | None], columns: int
 ) -> Frame:
-    """Return an image of frames in rows on white, each with its time below."""
+    """Return an image with rows of frames on white, each with its time below."""
     # Imported here, because Pillow is optional.
     from PIL import Image, ImageDraw, ImageFont
 
@@ -228,7 +228,7 @@ def _laid_out(
 
 
 def _labels(seconds: Sequence[float | None]) -> list[str]:
-    """Return the times as strings, with enough digits to tell them apart."""
+    """Return the times as strings with enough digits to distinguish them."""
     known = [time for time in seconds if time is not None]
     steps = [b - a for a, b in itertools.pairwise(known) if b > a]
     digits = 2

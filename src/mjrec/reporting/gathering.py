@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gathering the contents of a report from directories with recordings.
+"""Gathering of a report's contents from directories with recordings.
 
-This needs no simulator, OpenGL or ffmpeg. Unreadable files are listed among the
-problems, and the rest is shown.
+This needs no simulator, OpenGL or ffmpeg. Unreadable files are listed as problems, and
+all other files are shown.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ Directories = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 _UNKNOWN_ENVIRONMENT: Final = "unknown environment"
 _LONGEST_NAME: Final = 1000
 
-# The file of a verdict, in a directory with recordings.
+# The name of the verdict file in a directory with recordings.
 _VERIFICATION_NAME: Final = "verification.json"
 _VERDICTS: Final = ("PASS", "PARTLY", "FAIL")
 _OUTCOMES: Final = ("recreated", "within tolerance", "believed", "different")
@@ -74,8 +74,8 @@ def gather(
         directories: one or more evaluations, monitor directories, or folders that
             directly contain such directories.
         title: the page's title. None derives it from the recordings.
-        verifications: outputs of `mjrec verify --json`, in addition to the
-            `verification.json` of each directory.
+        verifications: outputs from `mjrec verify --json`, in addition to the
+            `verification.json` in each directory.
 
     Raises:
         InvalidArgument: a directory has no recordings, or does not exist.
@@ -106,7 +106,7 @@ def gather(
 
 
 def _find_recordings(directories: Directories) -> list[Path]:
-    """Return the directories that have recordings, in order, without duplicates."""
+    """Return the directories with recordings, in order, without duplicates."""
     if isinstance(directories, str | os.PathLike):
         directories = [directories]
     found: dict[str, Path] = {}
@@ -126,23 +126,23 @@ def _recordings_in(directory: Path) -> list[Path]:
     if not directory.is_dir():
         what = "is a file" if directory.exists() else "does not exist"
         raise InvalidArgument(
-            f"{directory} {what}. Name the directory that `mjrec evaluate`, `mjrec "
+            f"{directory} {what}. Pass the directory that `mjrec evaluate`, `mjrec "
             "record` (--out) or a Monitor wrote to."
         )
     try:
-        # Links are skipped: they may lead anywhere, even back into the folder.
+        # Links are skipped, because they may lead anywhere, even back into the folder.
         inside = (each for each in sorted(directory.iterdir()) if _is_folder(each))
         has_own = _has_recordings(directory)
         found = [directory] if has_own else [*filter(_has_recordings, inside)]
     except OSError as error:
         raise InvalidArgument(
-            f"{directory} cannot be read: {error.strerror}. Name a directory that you "
+            f"{directory} cannot be read: {error.strerror}. Pass a directory that you "
             "have permission to read."
         ) from error
     if not found:
         raise InvalidArgument(
-            f"{directory} contains no recordings, and neither do the folders directly "
-            f"in it. To record an episode, run `mjrec record ENV --out "
+            f"{directory} contains no recordings, and neither do its immediate "
+            f"subfolders. To record an episode, run `mjrec record ENV --out "
             f"{shlex.quote(str(directory))}`; for many episodes, `mjrec evaluate`."
         )
     return found
@@ -165,9 +165,9 @@ def _has_episodes(files: MonitorFiles) -> bool:
 
 @dataclass
 class _Recorded:
-    """The recordings of one environment by all monitors, in compact form."""
+    """All monitors' recordings of one environment, in compact form."""
 
-    # Distinct pairs only, in order: there may be thousands of monitors.
+    # Only distinct pairs, in order, because there may be thousands of monitors.
     provenance: dict[tuple[str, str], None] = field(default_factory=dict)
     videos: list[ReportVideo] = field(default_factory=list)
     runs: list[str] = field(default_factory=list)
@@ -181,8 +181,8 @@ def _add_monitors(
 
     Args:
         contents: the contents to extend.
-        directory: the directory that the page names.
-        places: the directories of the monitors' files.
+        directory: the directory that the page refers to.
+        places: the directories with the monitors' files.
     """
     by_name: dict[str, _Recorded] = {}
     for place, monitor in _monitors(contents, places):
@@ -196,13 +196,13 @@ def _add_monitors(
         recorded.rows.append(rows_of_monitor(episodes, run=len(recorded.runs)))
         recorded.runs.append(monitor.files.infix)
         recorded.provenance |= dict.fromkeys(monitor_facts.pairs_of_monitor(monitor))
-    # Monitors that could not be read at all are not an environment.
+    # Monitors that could not be read at all do not count as an environment.
     unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
     if unknown and not unknown.videos and not any(map(len, unknown.rows)):
         del by_name[_UNKNOWN_ENVIRONMENT]
     for name, recorded in by_name.items():
         rows = in_time(np.concatenate(recorded.rows))
-        # Do not hold them twice: a million episodes take 60 MB.
+        # Do not keep two copies, because a million episodes take 60 MB.
         recorded.rows.clear()
         find_episodes(recorded.videos, rows, recorded.runs)
         contents.tasks.append(
@@ -227,9 +227,9 @@ def _add_monitors(
 def _monitors(
     contents: ReportContents, places: Iterable[Path]
 ) -> Iterator[tuple[Path, MonitorResults]]:
-    """Yield the monitors of directories, with the directory of each.
+    """Yield the monitors in directories, each with its directory.
 
-    Callers should not keep them: a manifest contains much more than a page shows.
+    Callers should not keep the monitors: a manifest contains more than a page shows.
     """
     for place in places:
         try:
@@ -239,7 +239,7 @@ def _monitors(
             contents.problems.append(problem)
             continue
         for files in found:
-            # A monitor may have left nothing but its lock.
+            # A monitor may have left only its lock.
             if _has_episodes(files) or files.trajectories:
                 yield place, MonitorResults(files)
 
@@ -258,12 +258,12 @@ def _readable_episodes(
 
 
 def _complete(task: ReportTask) -> None:
-    """Join a task's provenance, order its videos by episode, and set their roles."""
+    """Merge a task's provenance, order its videos by episode, and set their roles."""
     renderers = [("OpenGL renderer", video.renderer or "") for video in task.videos]
     when = ("Recorded", monitor_facts.recorded_when(task.episodes))
     task.provenance = monitor_facts.joined([*task.provenance, *renderers, when])
     roles = episodes_with_roles(task)
-    # Sorting is stable, so the order of cameras stays.
+    # Sorting is stable, so the order of cameras is kept.
     task.videos = sorted(task.videos, key=lambda v: (v.index is None, v.index or 0))
     for video in task.videos:
         if video.index is not None:
@@ -275,7 +275,7 @@ def _complete(task: ReportTask) -> None:
 
 def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     try:
-        # Without the timing file, a video's episode is unknown.
+        # Without the timing file, the episode of a video is unknown.
         results = read_results(directory, needs_timing=True)
     except UnreadableFile as error:
         problem = f"{error} The recordings of its monitors are shown instead."
@@ -288,7 +288,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     elif results.bootstrap != contents.bootstrap:
         how = results.bootstrap
         contents.problems.append(
-            f"The intervals of {directory} were computed differently: {how.resamples} "
+            f"The intervals for {directory} were computed differently: {how.resamples} "
             f"resamples with seed {how.seed}, confidence {how.confidence:g}."
         )
     if results.across is not None and results.across.tasks:
@@ -323,8 +323,8 @@ def _videos_of_task(
 ) -> list[ReportVideo]:
     """Return the videos of a task's episodes, with the indices of the episodes.
 
-    Videos without an episode are left out: they come from a batch that was killed and
-    repeated.
+    Videos without an episode are left out, because they come from a chunk that was
+    killed and rerun.
     """
     columns, folder = results.by_task[task], results.folder(task)
     videos: list[ReportVideo] = []
@@ -355,11 +355,11 @@ def _add_verdict(contents: ReportContents, directory: Path) -> None:
 
 
 def _read_verdict(path: Path) -> Verdict:
-    """Return the verdict in an output of `mjrec verify --json`.
+    """Return the verdict in output from `mjrec verify --json`.
 
     Raises:
-        UnreadableFile: the file is missing, damaged, of a different kind, or
-            contradicts itself.
+        UnreadableFile: the file is missing, damaged, inconsistent or of a different
+            kind.
     """
     with unreadable(path):
         verification = read_object(path)
@@ -368,7 +368,7 @@ def _read_verdict(path: Path) -> Verdict:
         outcomes = Counter(json_field(each, "outcome", text) for each in findings)
         if verdict != "FAIL" and outcomes["different"]:
             raise ValueError(
-                f"it says {verdict}, but also that {outcomes['different']} items differ"
+                f"its verdict is {verdict}, but {outcomes['different']} items differ"
             )
         return Verdict(
             source=f"{json_field(verification, 'path', text)} ({path})",
@@ -387,7 +387,7 @@ def _title(tasks: Iterable[ReportTask], found: Iterable[Path]) -> str:
 
 
 class _Noting(logging.Handler):
-    """A log handler that collects this thread's warnings about skipped contents."""
+    """A log handler that collects this thread's warnings about skipped content."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__(logging.WARNING)

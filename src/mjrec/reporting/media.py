@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos of a report, copied next to its page or embedded in it.
+"""A report's videos, copied next to the page or embedded in it.
 
 Videos are copied, not linked, so that a report does not need the recordings. The copies
-get new names, which do not depend on the recorded ones.
+get new names, which do not depend on the original names.
 """
 
 from __future__ import annotations
@@ -61,22 +61,22 @@ OnProgress = Callable[[ReportProgress], object]
 
 
 def is_own_name(name: str) -> bool:
-    """Return whether a name has the form of a report's own video, poster or replay."""
+    """Return whether a name has the form of a video, poster or replay in a report."""
     return _OWN_NAME.fullmatch(name) is not None
 
 
 def add_images(contents: ReportContents, on_progress: OnProgress) -> None:
-    """Set the image of each video, except for text recordings and broken videos.
+    """Set the still image of each video, except for text recordings and broken videos.
 
-    Missing durations of videos are filled in. Videos that cannot be decoded are added
-    to the problems.
+    Missing video durations are filled in. Videos that cannot be decoded are listed as
+    problems.
 
     Args:
         contents: the contents, whose videos still have their recorded files.
         on_progress: called after each image.
     """
     moving = [video for video in contents.videos if video.path.suffix != _TEXT]
-    # Each image is a short run of ffmpeg on one CPU.
+    # Each image takes a short run of ffmpeg on one CPU.
     with ThreadPoolExecutor(usable_cpus()) as pool:
         for number, error in enumerate(pool.map(_add_image, moving), 1):
             if error is not None:
@@ -85,10 +85,10 @@ def add_images(contents: ReportContents, on_progress: OnProgress) -> None:
 
 
 def _add_image(video: ReportVideo) -> Error | None:
-    """Set a video's image, the middle frame as a JPEG; return the error, if any.
+    """Set a video's image to its middle frame as a JPEG; return the error, if any.
 
     The first frame often shows the initial pose, which is the same in all videos of a
-    task, and the last one a fall. The action is in between.
+    task. The last frame often shows a fall. The action is in between.
     """
     try:
         stream = read_stream(video.path)
@@ -140,10 +140,10 @@ def _named(contents: ReportContents) -> Iterator[tuple[str, ReportVideo]]:
 def write_replays(
     contents: ReportContents, folder: Path, on_progress: OnProgress
 ) -> None:
-    """Write a 3D page of each best, median and worst episode with recorded states.
+    """Write a 3D page for each best, median and worst episode with recorded states.
 
     Args:
-        contents: the contents, whose videos get the names of their pages.
+        contents: the contents, in which each video gets the name of its page.
         folder: the report's folder.
         on_progress: called after each page.
 
@@ -175,14 +175,13 @@ def write_replays(
 
 
 def with_embedded_videos(contents: ReportContents, *, room: int) -> ReportContents:
-    """Return contents with as many embedded videos as fit.
+    """Return contents with as many embedded videos as possible.
 
-    All images come first, then the videos in order. A video that does not fit is shown
-    by its image, with a note.
+    All images come first, then the videos in order. A video that does not fit is
+    represented by its image and a note.
 
     Args:
-        contents: the contents, whose videos have their recorded files. They are not
-            changed.
+        contents: the contents, whose videos have their recorded files; not modified.
         room: maximum number of characters for all embedded data.
     """
     contents = replace(
@@ -225,7 +224,7 @@ def with_embedded_videos(contents: ReportContents, *, room: int) -> ReportConten
 
 
 def _put(contents: ReportContents, video: ReportVideo, file: str, sha256: str) -> None:
-    """Set a video's file in the report and its hash; report a hash that changed."""
+    """Set a video's file in the report and its hash; report a changed hash."""
     if video.sha256 not in (None, sha256):
         note = (
             "This file does not match its metadata, which gives the SHA-256 "
@@ -243,7 +242,7 @@ def _copy(source: Path, target: Path) -> str:
         file = open_regular(source)
     with file, target.open("xb") as copy:
         while True:
-            # A full disk is not an error of the source.
+            # A full disk is not an error in the source.
             with unreadable(source):
                 block = file.read(_READ_SIZE)
             if not block:

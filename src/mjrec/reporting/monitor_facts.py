@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The provenance and the finished videos of monitors, from their files, for people.
+"""Human-readable provenance and finished videos of monitors, from their files.
 
-Facts that are missing in the files are left out. If monitors differ in a fact, all
-values are listed.
+Facts that are missing from the files are left out. If a fact differs between monitors,
+all values are listed.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Pairs = Iterable[tuple[str, str]]
 
 SELECTION: Final = "Selection of videos"
 
-# In the order of the page.
+# In the order used on the page.
 _LABELS: Final = (
     *("Environment", "Environment arguments", "Monitors", "Policy", "Protocol"),
     *("Seeds", "Episodes per seed", "Maximum steps per episode", SELECTION),
     *("Versions", "OpenGL renderer", "Recorded on", "Recorded"),
 )
-# Package names and how they are shown, in this order.
+# Package names and their display names, in display order.
 _PACKAGES: Final = {
     "mjrec": "mjrec",
     "mujoco": "MuJoCo",
@@ -52,7 +52,7 @@ _PACKAGES: Final = {
 }
 _SCHEDULES: Final = {
     "capped_cubic_video_schedule": "episodes 0, 1, 8, 27 ... 729, then every 1000th; "
-    "decided before each began",
+    "decided before each episode began",
     "disable_videos": "none",
 }
 _RULES: Final = {
@@ -69,7 +69,7 @@ _MOST_PIXELS: Final = 1 << 15
 
 
 def joined(pairs: Pairs) -> list[tuple[str, str]]:
-    """Return each label with its different values, in the order of the page.
+    """Return each label with its distinct values, in the order used on the page.
 
     Empty values are left out.
     """
@@ -85,7 +85,7 @@ def joined(pairs: Pairs) -> list[tuple[str, str]]:
 
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
-    """Return the label and value for the machine that a monitor recorded on."""
+    """Return the label and value for the machine on which a monitor recorded."""
     provenance = facts_in(_details(monitor).get("provenance"))
     cpu = facts_in(provenance.get("cpu")).get("model")
     return "Recorded on", _joined(cpu, provenance.get("system"))
@@ -108,7 +108,7 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
 
 
 def pairs_of_results(results: Evaluation, task: str) -> Iterator[tuple[str, str]]:
-    """Yield the provenance of the episodes of one task of an evaluation."""
+    """Yield the provenance of one task's episodes in an evaluation."""
     plan = results.plan
     yield "Environment", task
     yield "Environment arguments", ", ".join(kwargs_as_text(plan.env_kwargs))
@@ -175,7 +175,7 @@ def _schedule(details: Mapping[str, Any]) -> str:
     if name.startswith(_KEPT):
         rule = spaced(name.removeprefix(_KEPT))
         return f"{rule}; chosen after all episodes had ended"
-    return _SCHEDULES.get(name, f"chosen by {name} before each began")
+    return _SCHEDULES.get(name, f"chosen by {name} before each episode began")
 
 
 def _joined(*texts: Any) -> str:
@@ -187,12 +187,12 @@ def recorded_videos(
 ) -> list[ReportVideo]:
     """Return the existing finished videos of a monitor, without duplicates.
 
-    These are the videos that its manifest lists, and those that were finished after the
-    manifest was written, from all cameras. Text recordings are included.
+    These are the videos listed in the manifest and those finished after the manifest
+    was written, from all cameras. Text recordings are included.
 
     Args:
         results: the monitor's results.
-        directory: the directory of its files.
+        directory: the directory with the monitor's files.
         problems: a list to which missing and unreadable files are added.
     """
     found: list[ReportVideo] = []
@@ -219,7 +219,7 @@ def _names(results: MonitorResults) -> Iterator[str]:
     try:
         manifest = results.manifest
     except UnreadableFile:
-        # Its episodes cannot be read either, and reading them reports the error.
+        # Reading the episodes will also fail and report the error.
         manifest = None
     if manifest is not None:
         yield from (video for video, _ in manifest.videos)
@@ -230,7 +230,7 @@ def _names(results: MonitorResults) -> Iterator[str]:
 
 
 def _order(name: str) -> tuple[int, str, str]:
-    # The first camera's video comes before those of the others.
+    # The first camera's video comes before the videos from other cameras.
     return episode_of(name) or 0, view_of(name), name
 
 
@@ -310,13 +310,13 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
         )
         of = f" from {among} episodes" if type(among) is int else ""
         if selection.get("decided") is True:
-            yield f"Chosen by {rule}{of} after they had ended."
+            yield f"Chosen by {rule}{of} after all episodes had ended."
         else:
-            yield f"Kept by a run that ended before it could choose by {rule}."
+            yield f"Kept because the run ended before {rule} could be applied."
 
 
 def _known(facts: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:
-    """Return a field of the metadata; None if it is missing or invalid."""
+    """Return a field from the metadata; None if it is missing or invalid."""
     try:
         return field(facts, key, read)
     except ValueError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HTML page of a report, which opens from disk without a network.
+"""A report's HTML page, which opens from disk and needs no network.
 
-Everything on it may come from untrusted files. It is shown as text: escaped, shortened
-if too long, with invisible characters spelled out. A content security policy with the
-hashes of the page's own style and script prevents anything else from running, and
+Everything on the page may come from untrusted files. It is shown as text: escaped,
+shortened if too long, with invisible characters spelled out. A content security policy
+with the hashes of the page's own style and script prevents other code from running, and
 allows only images and videos from disk.
 """
 
@@ -36,8 +36,8 @@ _LONGEST_NAME: Final = 120
 _LONGEST_REASON: Final = 300
 _LONGEST_COMMAND: Final = 8000
 
-# Limits of what a browser opens quickly: rows in the table of episodes, which are only
-# numbers until they are shown, and players and figures, which are elements of the page.
+# Limits that keep the page fast in a browser: the number of rows in the episode table,
+# which are only data until shown, and of players and figures, which are page elements.
 _MOST_EPISODES: Final = 20_000
 _MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
@@ -51,11 +51,11 @@ _Pairs = Sequence[tuple[str, str]]
 
 
 def page_of(contents: ReportContents) -> str:
-    """Return the HTML of a report's page.
+    """Return a report's HTML page.
 
-    The same contents give the same HTML. If there are more than 20,000 episodes, the
+    The same contents yield the same HTML. If there are more than 20,000 episodes, the
     table contains only those with videos, those that failed, and each task's best and
-    worst, and says where to find the others.
+    worst. A note says where to find the others.
 
     Raises:
         MissingDependency: Jinja2 is not installed.
@@ -110,7 +110,7 @@ def _hash(text: str) -> str:
 @cache
 def _environment() -> Any:
     try:
-        # Imported here, because it is optional: nothing else in mjrec needs it.
+        # Imported here, because it is optional and only reports need it.
         import jinja2
     except ImportError as error:
         raise MissingDependency(
@@ -119,7 +119,7 @@ def _environment() -> Any:
     from markupsafe import Markup, escape
 
     def shown(value: Any) -> Any:
-        """Return a template's value, with untrusted strings made safe to show."""
+        """Return a template value, with untrusted strings made safe to show."""
         is_text = isinstance(value, str) and not isinstance(value, Markup)
         return spelled_out(value) if is_text else value
 
@@ -133,7 +133,7 @@ def _environment() -> Any:
     )
     environment.filters.update(
         name=lambda text: spelled_out(text, _LONGEST_NAME),
-        # A name that may wrap after each `/`.
+        # A name with optional line breaks after each `/`.
         broken=lambda text: escape(spelled_out(text, _LONGEST_NAME)).replace(
             "/", Markup("/<wbr>")
         ),
@@ -179,7 +179,7 @@ def _bar(summary: TaskSummary) -> dict[str, Any] | None:
 
 
 def _method(summary: TaskSummary, how: Bootstrap) -> str | None:
-    """Return the method of a task's intervals; None if it has none."""
+    """Return the method for a task's intervals; None if there are none."""
     if summary.mean_interval is None and summary.iqm_interval is None:
         return None
     return _in_words(summary.interval_method or PERCENTILE_BOOTSTRAP, how)
@@ -195,7 +195,7 @@ def _in_words(method: str | None, how: Bootstrap) -> str | None:
 def _notes(
     tasks: Iterable[ReportTask], methods: Iterable[str | None], usual: str | None
 ) -> dict[str, list[str]]:
-    """Return notes about missing or different statistics, each with its tasks."""
+    """Return notes about missing or different statistics, each with affected tasks."""
     notes: dict[str, list[str]] = {}
     for task, method in zip(tasks, methods, strict=True):
         if count := task.summary.not_finite:
@@ -215,7 +215,7 @@ def _notes(
 def _profile(contents: ReportContents) -> str:
     if all(each.profile is None for each in contents.across.values()):
         return ""
-    # Names become part of the figure's description: no markup or invisible characters.
+    # Names become part of the figure's description, so spell out invisible characters.
     across = {spelled_out(name): each for name, each in contents.across.items()}
     return profile_curve(across, key="profile")
 
@@ -233,9 +233,9 @@ def _figures(tasks: Sequence[ReportTask]) -> Iterator[tuple[str, str]]:
 
 
 def _cards(contents: ReportContents) -> list[dict[str, Any]]:
-    """Return the cards of the videos that are shown.
+    """Return the cards for the displayed videos.
 
-    They are ordered by task, then best, median, worst, and all others.
+    The order is by task, then best, median, worst, and all others.
     """
     tasks = [i for i, task in enumerate(contents.tasks) for _ in task.videos]
     videos = contents.videos
@@ -254,7 +254,7 @@ def _cards(contents: ReportContents) -> list[dict[str, Any]]:
 def _card(
     index: int, video: ReportVideo, number_of_task: int, contents: ReportContents
 ) -> dict[str, Any]:
-    """Return a video in the gallery, with the facts about its episode."""
+    """Return the gallery card of a video, with the facts about its episode."""
     task, which, reward = contents.tasks[number_of_task], "", None
     facts: list[tuple[str, str]] = []
     if video.index is not None:
@@ -291,7 +291,7 @@ def _card(
 
 
 def _selection(tasks: Iterable[ReportTask]) -> list[str]:
-    """Return the rules that chose the episodes with videos, from the provenance."""
+    """Return the rules that chose the episodes for videos, from the provenance."""
     said = (pair for task in tasks for pair in task.provenance)
     rules = (value for label, value in said if label == SELECTION)
     return list(dict.fromkeys(rules))[:10]
@@ -301,7 +301,7 @@ def _selection(tasks: Iterable[ReportTask]) -> list[str]:
 
 
 def _episodes(contents: ReportContents, shown: set[int]) -> dict[str, Any]:
-    """Return the data of the table of episodes, as columns.
+    """Return the data for the table of episodes, as columns.
 
     Args:
         contents: the report's contents.
@@ -330,11 +330,11 @@ def _episodes(contents: ReportContents, shown: set[int]) -> dict[str, Any]:
 def _most_telling(
     task: ReportTask, videos: Mapping[int, object], most: int | None
 ) -> NDArray[np.intp]:
-    """Return the indices of episodes with videos, failed ones, the best and the worst.
+    """Return the indices of episodes that have videos, failed, or are best or worst.
 
     Args:
         task: the task.
-        videos: its videos, by the episode's index.
+        videos: the task's videos, keyed by episode index.
         most: maximum number of each kind; None means all episodes.
     """
     if most is None:
@@ -372,7 +372,7 @@ def _columns(
 
 
 def _json_numbers(values: NDArray[np.float64], decimals: int) -> list[float | None]:
-    """Return numbers with two more decimals than are shown, so that they sort well.
+    """Return numbers with two more decimals than displayed, for correct sorting.
 
     NaN and infinite numbers become None.
     """
@@ -385,7 +385,7 @@ def _json_numbers(values: NDArray[np.float64], decimals: int) -> list[float | No
 
 
 def _where_all_are(tasks: Iterable[ReportTask]) -> list[str]:
-    """Return, for each directory, the file or call that gives all of its episodes."""
+    """Return, for each directory, the file or call that provides all its episodes."""
     places = (
         f"{task.source.rstrip('/')}/results.csv"
         if task.is_evaluation
@@ -399,7 +399,7 @@ def _where_all_are(tasks: Iterable[ReportTask]) -> list[str]:
 
 
 def _provenance(tasks: Sequence[ReportTask]) -> tuple[_Pairs, list[tuple[str, _Pairs]]]:
-    """Return the pairs that all tasks share, and the other pairs by task."""
+    """Return the pairs that all tasks share, and the other pairs keyed by task."""
     said = [list(task.provenance) for task in tasks]
     everywhere = set.intersection(*map(set, said)) if said else set()
     differing = [

@@ -25,8 +25,8 @@ def decimals_for(values: Iterable[float | None]) -> int:
     largest = max(known, default=0.0)
     if largest == 0:
         return 0
-    # Four significant digits for the largest number, but never fewer than all digits
-    # before the decimal point.
+    # Four significant digits for the largest number, but always all digits before the
+    # decimal point.
     return min(9, max(0, 3 - math.floor(math.log10(largest))))
 
 
@@ -55,7 +55,7 @@ def interval_text(interval: Interval | None, decimals: int) -> str:
 
 
 def address(path: str) -> str:
-    """Return the address of a file next to the page, whatever its name looks like."""
+    """Return the address of a file next to the page, even for an unusual name."""
     if _DATA.fullmatch(path):
         return path
     # With "./" in front, even `javascript:x` and `//host/x` are only file names.

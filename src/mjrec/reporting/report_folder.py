@@ -9,9 +9,8 @@
     ├── posters/        a frame of each: 0000-dm-control-walker-walk.jpg ...
     └── replays/        3D pages of some: 0000-dm-control-walker-walk.html ...
 
-The folder can be moved, and does not need the recordings. It gets its name only when it
-is complete. It then replaces an existing folder, if that contains a report and nothing
-else.
+The folder can be moved, and does not need the recordings. It gets its final name only
+when complete. It then replaces an existing folder if that contains only a report.
 """
 
 from __future__ import annotations
@@ -55,23 +54,23 @@ def write_report(
 ) -> Path:
     """Write a web page about recordings, and return its path.
 
-    It has a summary of each task, curves, videos, all episodes, and their provenance.
-    It works for evaluations and for any monitor directory, including old gym's, without
-    MuJoCo or OpenGL. Unreadable files are named on the page.
+    The page has a summary of each task, curves, videos, all episodes, and their
+    provenance. It supports evaluations and all monitor directories, including old
+    gym's, and needs neither MuJoCo nor OpenGL. Unreadable files are listed on the page.
 
     Args:
         directories: one or more evaluations, monitor directories, or folders that
             contain them.
         path: the folder to write. An existing report is replaced; any other non-empty
-            folder is left alone. With `single_file` it may end in `.html`, and is then
-            the page itself.
+            folder is left alone. With `single_file`, a path that ends in `.html` is the
+            page itself.
         title: title of the page. None derives it from the recordings.
         single_file: put images and videos into the page itself: posters first, then
-            videos in order, up to `max_single_file_bytes`. The others are only named.
-        max_single_file_bytes: size limit of the page with `single_file`.
+            videos in order, up to `max_single_file_bytes`. The rest is only listed.
+        max_single_file_bytes: size limit for the page with `single_file`.
         replays: add a 3D page (`write_replay`) next to the videos of the best, median
             and worst episodes. It is loaded only when opened.
-        verifications: outputs of `mjrec verify --json`. A `verification.json` in a
+        verifications: outputs from `mjrec verify --json`. A `verification.json` in a
             directory is found automatically.
         on_progress: called with a `ReportProgress` for each poster, video and replay.
 
@@ -80,14 +79,14 @@ def write_report(
             report, the page alone is larger than `max_single_file_bytes`, or `replays`
             and `single_file` are combined.
         UnreadableFile: a file in `verifications` cannot be read.
-        MissingDependency: Jinja2 is not installed, or viser for replays.
+        MissingDependency: Jinja2, or viser for replays, is not installed.
         FileNotWritten, DirectoryNotWritable: the disk is full or read-only.
     """
     target = Path(os.path.realpath(path))
     is_page = target.suffix.lower() in _PAGE_ENDINGS
     if is_page and not single_file:
         raise InvalidArgument(
-            f"{path} names a page, but a report is a folder. Name a folder, or request "
+            f"{path} is a page's name, but a report is a folder. Pass a folder, or use "
             "a single file (single_file=True, --single-file)."
         )
     if replays and single_file:
@@ -133,7 +132,7 @@ def _single_page(contents: ReportContents, most_bytes: int) -> str:
 
 
 def _check_target(target: Path, *, is_page: bool) -> None:
-    """Raise InvalidArgument if something exists there that must not be replaced."""
+    """Raise InvalidArgument if the target exists and must not be replaced."""
     if not os.path.lexists(target):
         return
     if is_page:
@@ -179,7 +178,7 @@ def _is_own_page(path: Path) -> bool:
 def _replacing_folder(target: Path) -> Iterator[Path]:
     """Yield a new folder next to `target`; replace `target` with it after the block.
 
-    If the block raises, the new folder is removed, and an existing one is unchanged.
+    If the block raises an error, the new folder is removed and `target` is unchanged.
     """
     make_directory(target.parent)
     folder, before = temporary_path(target), temporary_path(target)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a video file: its stream facts, and decoded frames.
+"""Reading of video files: stream facts and decoded frames.
 
-ffmpeg (imageio's) reads a file only in the format that its first bytes indicate, and
-opens no other files for it.
+imageio's ffmpeg reads a file only in the format that its first bytes indicate, and
+opens no other files.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..formats.regular_files import open_regular, regular_path
 from ..frames import Frame
 
 _BEGIN: Final = 12
-# ffmpeg's names of the formats, by suffix.
+# ffmpeg's names for the formats, by suffix.
 _KINDS: Final = {".mp4": "mp4", ".avi": "avi", ".mkv": "matroska"}
 
 _HEADER: Final = re.compile(rb"^#(tb|dimensions) 0: (\d+)[/x](\d+)$", re.MULTILINE)
@@ -40,14 +40,14 @@ _AT_ONCE: Final = 16
 
 @dataclass(frozen=True)
 class VideoStream:
-    """The facts of a video's stream, without decoded frames.
+    """The facts about a video's stream, without decoded frames.
 
     Attributes:
         path: the video file, which is not a link.
         height: height in pixels.
         width: width in pixels.
         times: `(n,) float64`, ascending: the time of each frame, in seconds after the
-            first.
+            first frame.
         seconds: duration in seconds.
     """
 
@@ -62,7 +62,7 @@ class VideoStream:
 
 
 def video_kind(path: Path) -> str | None:
-    """Return the suffix for a file's first bytes; None if it is not a known video.
+    """Return the suffix for a file's first bytes; None if the format is unknown.
 
     Raises:
         UnreadableFile: the file cannot be read, or is not a regular file.
@@ -77,7 +77,7 @@ def video_kind(path: Path) -> str | None:
 
 
 def read_stream(path: Path) -> VideoStream:
-    """Return the facts of a video file's stream.
+    """Return the facts about a video file's stream.
 
     Raises:
         UnreadableFile: the file is not a video, or has no frames.
@@ -114,7 +114,7 @@ def frames_at(
 
     Raises:
         EncoderError: the video cannot be decoded up to these frames.
-        UnreadableFile: the video has fewer frames than it claims.
+        UnreadableFile: the video has fewer frames than its packets indicate.
     """
     width, scale = stream.width, ""
     if most_width is not None and most_width < width:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, given by name, by number or as an `MjvCamera`, and the cameras of a model.
+"""Cameras: finding them by name or number, and choosing a model's default camera.
 
-Every function takes MuJoCo's own objects or wrappers of them. A wrapper has the
-original object as `.ptr`, as in dm_control.
+Every function accepts MuJoCo's own objects or wrappers around them. A wrapper holds the
+original object in `.ptr`, as in dm_control.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
-# The members of a camera that is not fixed, for the metadata.
+# The members that the metadata includes for a camera that is not fixed.
 _POSE = (
     *("type", "trackbodyid", "lookat", "distance", "azimuth", "elevation"),
     "orthographic",
@@ -36,19 +36,19 @@ _TRAVELLING_JOINTS = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT
 
 
 def raw_model(model: Any) -> mujoco.MjModel:
-    """Return the `mujoco.MjModel` that `model` is or wraps.
+    """Return `model`, or the `mujoco.MjModel` that it wraps.
 
     Raises:
-        InvalidArgument: `model` is neither a model nor a wrapper of one.
+        InvalidArgument: `model` is neither a model nor a wrapper around one.
     """
     return _unwrapped(model, mujoco.MjModel)
 
 
 def raw_data(data: Any) -> mujoco.MjData:
-    """Return the `mujoco.MjData` that `data` is or wraps.
+    """Return `data`, or the `mujoco.MjData` that it wraps.
 
     Raises:
-        InvalidArgument: `data` is neither an `MjData` nor a wrapper of one.
+        InvalidArgument: `data` is neither an `MjData` nor a wrapper around one.
     """
     return _unwrapped(data, mujoco.MjData)
 
@@ -66,9 +66,9 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
     Args:
         model: the model that the camera belongs to.
         camera: the name or number of one of the model's cameras; -1 for the free
-            camera at the model's default pose; a mapping with values for the public
-            members of an `MjvCamera` by name (the others keep MuJoCo's defaults); or
-            an `MjvCamera`, which is returned unchanged.
+            camera at the model's default pose; a mapping from names of public
+            `MjvCamera` members to values (other members keep MuJoCo's defaults); or an
+            `MjvCamera`, which is returned unchanged.
 
     Raises:
         UnknownName: the model has no camera with that name, or `MjvCamera` has no such
@@ -84,7 +84,7 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
         for name, value in camera.items():
             if name.startswith("_") or not hasattr(resolved, name):
                 known = [known for known in dir(resolved) if not known.startswith("_")]
-                raise UnknownName("member of mujoco.MjvCamera", name, known)
+                raise UnknownName("mujoco.MjvCamera member", name, known)
             setattr(resolved, name, value)
         check_camera(model, resolved)
         return resolved
@@ -98,10 +98,10 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
 
 
 def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Check that the model has the body or the fixed camera that a camera refers to.
+    """Check that the model has the body or the fixed camera to which a camera refers.
 
     Raises:
-        InvalidArgument: the model does not have it, or the camera's type is invalid.
+        InvalidArgument: the model lacks this body or camera, or the type is invalid.
     """
     numbered = {
         _FIXED: ("fixedcamid", model.ncam),
@@ -130,11 +130,11 @@ def is_tracking(camera: object) -> bool:
 def tracking_camera(model: Any) -> str | int | None:
     """Return the camera in the model that follows the robot, if there is one.
 
-    This is the first camera that follows the centre of mass of a body's subtree
-    (`mode="trackcom"`). If there is no such camera, it is the first one that follows a
-    body (`mode="track"`) of a robot that can travel, because a free or sliding joint
-    connects it to the world. An arm with a fixed base cannot travel, and a camera that
-    follows its hand is a close-up.
+    This is the first camera that follows the center of mass of a body's subtree
+    (`mode="trackcom"`). If there is none, it is the first camera that follows a body
+    (`mode="track"`) of a robot that can travel, that is, has a free or sliding joint to
+    the world. An arm with a fixed base cannot travel, and a camera that follows its
+    hand is a close-up.
 
     Returns:
         The camera's name, or its number if it has no name. None if no camera follows
@@ -167,7 +167,7 @@ def default_camera(model: Any) -> str | int:
 
 
 def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
-    """Return a camera for the metadata: a name, a number or a free camera's pose.
+    """Return a camera's metadata label: its name, its number or a free camera's pose.
 
     Args:
         model: the model that has the camera.
@@ -206,7 +206,7 @@ def _unwrapped(holder: object, kind: type) -> Any:
         if isinstance(candidate, kind):
             return candidate
     raise InvalidArgument(
-        f"This must be a mujoco.{kind.__name__} or dm_control's wrapper of one, not "
+        f"This must be a mujoco.{kind.__name__} or a dm_control wrapper for one, not "
         f"{type(holder).__module__}.{type(holder).__qualname__}."
     )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The capture of states from the MuJoCo simulation inside an environment."""
+"""Capture of states from the MuJoCo simulation inside an environment."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class EpisodeStart:
         model: the stored model's facts, for the trajectory.
         scene: the scene's facts, for the trajectory; None without snapshots.
         model_fields: the fields that differ from the stored model.
-        refusal: the reason why no frame can be drawn from snapshots of this model; None
-            if frames can be drawn, which has been checked.
-        words: the indices into `raw_memory.WORDS` for gathering rows of state and
+        refusal: the reason why snapshots of this model are not enough to draw frames;
+            None if a check found that they are.
+        words: the indices in `raw_memory.WORDS` for gathering rows of state and
             snapshot while `is_current` returns True; None if each capture must check
             for changes.
         is_current: a function that returns whether only the state has changed since the
@@ -82,9 +82,8 @@ class Capture:
         view: a function that returns the view of the scene, called when an episode
             begins. The view's camera and option may be the environment's own, so they
             are watched for changes.
-        at_frame: a function that calls its argument at the moment at which the
-            environment would draw, and then restores everything; None if any moment
-            will do.
+        at_frame: a function that calls its argument at the moment when the environment
+            would draw, and then restores the simulation; None if any moment will do.
         resetting: a function that returns a context manager for each reset.
         authored: a function that returns the model's sources, or None if unknown.
         obstacle: a function that returns the reason why the current frame cannot be
@@ -192,7 +191,7 @@ class Capture:
                 this was possible when the episode began.
         """
         if self._frames is not None and self._is_current():
-            # The usual case takes half the time of the others.
+            # This usual case takes half as long as the others.
             self._frames.source.take(out)
             return None
         _, frames = self._followed()
@@ -208,7 +207,7 @@ class Capture:
         return own or None
 
     def model_changed(self) -> None:
-        """Make the next capture check everything in the model for changes."""
+        """Make the next capture check the whole model for changes."""
         self._looks_at_everything = True
         self._look_closely()
 
@@ -216,7 +215,7 @@ class Capture:
         """Make the next episode's frames independent of all previous frames.
 
         Call this between episodes. Cameras that are placed at the first frame, or that
-        each frame moves, will be as in a new simulation.
+        each frame moves, will start as in a new simulation.
         """
         self._forget()
         self._frames = None
@@ -224,7 +223,7 @@ class Capture:
             self._stored.scene = None
 
     def settle(self) -> None:
-        """Wait until no model is left to be stored; `finish` reports any failures."""
+        """Wait until no model is left to store; `finish` reports any failures."""
         if self._store is not None:
             self._store.settle()
 
@@ -266,7 +265,7 @@ class Capture:
         view: SceneView,
         fields: Iterable[str],
     ) -> _Frames:
-        """Return the last source of snapshots if it still fits, otherwise a new one."""
+        """Return the last snapshot source if it is still valid, otherwise a new one."""
         stored.looks.follow(view)
         key = (
             *(data._address, id(view.camera), id(view.option), view.max_geom),
@@ -356,7 +355,7 @@ class _Frames:
     positions without drawing.
 
     Attributes:
-        key: everything that this object depends on, for comparison.
+        key: everything on which this object depends, for comparison.
         kind: the snapshots' dtype.
         source: the source of the snapshots.
         words: the indices of a row's words; None if a row cannot be gathered.
@@ -382,7 +381,7 @@ class _Frames:
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts about the scene, including those left by the last frame."""
+        """Return the scene's facts, including the cameras after the last frame."""
         facts = {**self._facts}
         before = self._stored.scene
         if self.scene is not None and not self.view.fresh and before is not None:
@@ -427,7 +426,7 @@ class _Frames:
     def drawn(
         self, changed: dict[str, NDArray[Any]] | None
     ) -> dict[str, NDArray[Any]] | None:
-        """Move the cameras as drawing a frame would, and add that to the changes."""
+        """Move the cameras as drawing would, and add their movement to the changes."""
         if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
             self._follow_camera()
         if self.scene is None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arrays of a simulation that a snapshot contains, so that a frame can be drawn.
+"""The arrays of a simulation that a snapshot must contain for drawing a frame.
 
-They are about 20 of the more than 100 arrays in `MjData`. The state (see `states`) does
-not determine them on its own: after a step, they belong to the state before the last
-substep, and environments move things just before they draw.
+These are about 20 of the more than 100 arrays in `MjData`. The state (see `states`)
+alone does not determine them: after a step, they belong to the state before the last
+substep, and environments may move objects just before drawing.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from .raw_memory import address_of
 
 _JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
-# The colours of the tendons in the frame. This is not an array in `MjData`; the colours
-# are restored into the model's array with this name.
+# The colors of the tendons in the frame. `MjData` has no such array; the colors are
+# restored into the model's array with this name.
 TENDON_RGBA = "tendon_rgba"
 
 # Arrays that any camera may need with MuJoCo's default option, if they are not empty.
@@ -35,12 +35,12 @@ _FOR_OPTIONS = (
     *("eq_active", "xfrc_applied", "bvh_active", "bvh_aabb_dyn"),
 )
 
-# Nothing else is ever written from a file into an `MjData`.
+# No other array is ever copied from a file into an `MjData`.
 SNAPSHOT_ARRAYS = frozenset(
     (*ALWAYS, *_FOR_SKINS, *_FOR_OPTIONS, "sensordata", "plastic")
 )
 
-# These are drawn from a step's constraints, which cannot be put into a new `MjData`.
+# These flags draw a step's constraints, which cannot be put into a new `MjData`.
 _CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
 
 # Sensors whose readings are drawn as rays.
@@ -52,7 +52,7 @@ def snapshot_dtype(
 ) -> np.dtype[Any]:
     """Return the dtype of a snapshot of a simulation's data.
 
-    It has all non-empty arrays that the default option needs with any camera, and
+    It includes all non-empty arrays that the default option needs with any camera, and
     those that `option` needs in addition.
 
     Args:
@@ -72,7 +72,7 @@ def snapshot_dtype(
     if option is not None and _shows_more(option):
         names.update(_FOR_OPTIONS)
     held = [name for name in names if array_kind(data, name) is not None]
-    # In memory order, which is faster to read.
+    # Reading in memory order is faster.
     held.sort(key=lambda name: address_of(getattr(data, name)))
     arrays = [(name, array_kind(data, name)) for name in held]
     if has_limited_tendons(model):
@@ -81,7 +81,7 @@ def snapshot_dtype(
 
 
 def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
-    """Return the dtype and shape of a model's or data's array, or None if empty."""
+    """Return the dtype and shape of an array of a model or data; None if empty."""
     # Some arrays, such as `bvh_active`, are not in every version.
     array = getattr(holder, name, None)
     if array is None or not array.size:
@@ -90,7 +90,7 @@ def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
 
 
 def has_limited_tendons(model: mujoco.MjModel) -> bool:
-    """Return whether a tendon may be drawn in a colour different from the model's."""
+    """Return whether a tendon may be drawn in a color different from the model's."""
     if not model.ntendon:
         return False
     spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP
@@ -99,10 +99,10 @@ def has_limited_tendons(model: mujoco.MjModel) -> bool:
 
 
 def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:
-    """Return the reason why no snapshot suffices for `option`, or None if one does.
+    """Return the reason why snapshots are not enough for `option`, or None if they are.
 
-    Contacts, constraint islands and joints at their limits are drawn from the
-    constraints of a step.
+    Contacts, constraint islands and joints at their limits are drawn from a step's
+    constraints.
     """
     shown = [name for name in _CONSTRAINT_FLAGS if _flag(option, name)]
     if _flag(option, "mjVIS_ISLAND") and _has_islands(model):
@@ -116,8 +116,8 @@ def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | 
     if not shown:
         return None
     return (
-        f"{' and '.join(shown)} of the visual options show constraints (contacts, "
-        "joints at their limits), which are not kept after the step"
+        f"{' and '.join(shown)} in the visual options show constraints (contacts, "
+        "joints at their limits), which MuJoCo discards after the step"
     )
 
 

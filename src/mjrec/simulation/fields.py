@@ -46,7 +46,7 @@ def struct_names() -> tuple[str, ...]:
 
 @functools.cache
 def empty_model() -> mujoco.MjModel:
-    """Return an empty model, which must not be modified."""
+    """Return an empty model. Do not modify it."""
     return mujoco.MjModel.from_xml_string("<mujoco/>")
 
 
@@ -70,7 +70,7 @@ def member_names(struct: object) -> Iterator[str]:
 
 
 def holder_of(struct: Any, name: str) -> tuple[Any, str]:
-    """Return the object that has the member, and the last part of a dotted name."""
+    """Return the object that has the member, and the last part of the dotted name."""
     *parts, last = name.split(".")
     return functools.reduce(getattr, parts, struct), last
 
@@ -111,15 +111,15 @@ def apply_fields(
     Args:
         model: the model to change.
         fields: values by name.
-        camera: the camera that gets the fields that begin with `camera.`; if None,
-            these fields are skipped.
-        option: the option that gets the fields that begin with `option.`; if None,
-            these fields are skipped.
+        camera: the camera to set fields that begin with `camera.` in; if None, these
+            fields are skipped.
+        option: the option to set fields that begin with `option.` in; if None, these
+            fields are skipped.
 
     Raises:
         InvalidArgument: a field does not exist, its value has the wrong shape, type or
-            range, or it may not be set (see `is_settable`). Earlier fields have then
-            already been set.
+            range, or it may not be set (see `is_settable`). Any fields before it have
+            been set.
     """
     view = {"camera": camera, "option": option}
     for name, value in fields.items():
@@ -134,9 +134,9 @@ def apply_fields(
 def is_settable(name: str) -> bool:
     """Return whether a model's field may be set to a value from a file.
 
-    MuJoCo trusts types, addresses and most indices in a model: a wrong value makes it
-    read out of bounds. Floating-point numbers, flags, texture data and indices that can
-    be checked are settable.
+    MuJoCo trusts types, addresses and most indices in a model, so a wrong value makes
+    it read out of bounds. Floating-point numbers, flags, texture data and indices that
+    can be checked are settable.
     """
     if "." in name or name in _INDICES or _INTEGERS.fullmatch(name):
         return True
@@ -146,7 +146,7 @@ def is_settable(name: str) -> bool:
 _HARMLESS_TYPES = ("<f4", "<f8", "|u1", "|b1")
 _INTEGERS = re.compile(r"\w+_(contype|conaffinity|group|condim|priority)")
 
-# Indices, with the model's size that limits each; -1 means no index.
+# Index fields, each with the model size that limits its values; -1 means no index.
 _INDICES = {
     **dict.fromkeys(
         ("geom_matid", "site_matid", "skin_matid", "flex_matid", "tendon_matid"), "nmat"
@@ -161,15 +161,15 @@ _KINDS = {
     "option.frame": int(mujoco.mjtFrame.mjNFRAME),
 }
 
-# The locations of a model's files when it was compiled, and a checksum that does not
-# matter here.
+# The locations of a model's files at compile time, and a checksum that does not matter
+# here.
 _PLACES = re.compile(r"paths|npaths|nbuffer|signature|\w+_(path|contenttype)adr")
 
 
 def differing_fields(
     model: mujoco.MjModel, other: mujoco.MjModel
 ) -> dict[str, NDArray[Any]]:
-    """Return the fields of `other` that differ from `model`, for `apply_fields`.
+    """Return the fields in which `other` differs from `model`, for `apply_fields`.
 
     Environments set some fields of a model after compiling it, such as the size of the
     frame buffer or the position of a target. The locations of the models' files are not
@@ -190,7 +190,7 @@ def differing_fields(
     changed = {n: theirs[n] for n in names if ours[n].tobytes() != theirs[n].tobytes()}
     fixed = [name for name in changed if not is_settable(name)]
     if fixed:
-        raise ValueError(f"{', '.join(fixed)} differ, which only compiling can change")
+        raise ValueError(f"{', '.join(fixed)} differ, and only compiling changes them")
     return changed
 
 
@@ -227,7 +227,7 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
         or (is_whole and not (np.floor(value) == value).all())
     ):
         raise InvalidArgument(
-            f"The model field {field} must be {'whole ' * is_whole}numbers of shape "
+            f"The model field {field} must hold {'whole ' * is_whole}numbers of shape "
             f"{np.shape(present)} here, but the recorded value is {value.dtype} of "
             f"shape {value.shape}: it belongs to another model."
         )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that find the MuJoCo simulation inside an environment, by duck typing.
 
-They import nothing, because an environment without a simulation must not load MuJoCo,
-which chooses its OpenGL backend on import.
+They import nothing, because MuJoCo chooses its OpenGL backend on import and must not be
+loaded for an environment without a simulation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _HOLDERS = ("physics", "point_env", "ant_env", "robot_env")
 def simulation_in(env: object) -> Any:
     """Return the object that has MuJoCo's `model` and `data` as attributes.
 
-    These are MuJoCo's own objects, or dm_control's wrappers of them.
+    Both attributes are MuJoCo's own objects or dm_control's wrappers around them.
 
     Args:
         env: a Gymnasium or dm_env environment, wrapped or not.

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A resource-limited process that reads untrusted files, and the program that it runs.
 
-A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
-names can take any amount of time. A damaged file may crash or hang the HDF5 library.
-One line of MJCF can ask for a body replicated a billion times.
+A few kilobytes of HDF5 can claim any amount of memory. Reading the same data under a
+million names can take any amount of time. A damaged file may crash or hang the HDF5
+library. One line of MJCF can request a billion copies of a body.
 
-So if this user has not recorded into a trajectory's directory (see `model_trust`), such
-a process reads the whole trajectory once before this process does. All model sources
-are compiled in such a process too. This takes half a second. The user's own
-trajectories and models cost nothing.
+So unless this user has recorded into a trajectory's directory (see `model_trust`), a
+limited process first reads the whole trajectory. All model sources are also compiled in
+a limited process. This takes half a second. The user's own trajectories and models need
+no check.
 
 Logs of recordings in flight are not compressed, so reading them takes no more memory
 than their size.
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 _GIB = 1 << 30
 _LONGEST_REASON = 2000
 
-# Memory for the data that `load_trajectory` reads: this much, plus this many times the
-# size of the file. A robot that stands still compresses that well; a file made to
+# Memory for the data that `load_trajectory` reads: a fixed amount, plus a multiple of
+# the file size. A recording of a robot at rest compresses that well, but a file made to
 # exhaust memory compresses a thousandfold.
 _READING_MEMORY = 2 * _GIB
 _MOST_EXPANSION = 64
-# HDF5's compression can pack at most a gigabyte into a megabyte of file. Unpacking it
-# takes some seconds of CPU time, and the machine may be busy.
+# A megabyte of HDF5 unpacks to at most a gigabyte. This takes a few seconds of CPU
+# time, and the machine may be busy.
 _CPU_SECONDS = 8
 _CPU_SECONDS_PER_MB = 4
 _SECONDS_PER_CPU_SECOND = 10
@@ -50,21 +50,21 @@ _ROWS_AT_ONCE = 256
 
 # Even the largest robots and rooms compile in seconds.
 _COMPILING_SECONDS = 300.0
-# Enough for Python, MuJoCo and their threads, with some room to spare.
+# Enough for Python, MuJoCo and their threads, with room to spare.
 _COMPILING_MEMORY = 6 * _GIB
 _MEMORY_FACTOR = 8
 _COMPILED = "model.mjb"
 
-# Name, device, inode, size and times of the files that proved harmless.
+# Name, device, inode, size and times of files that proved harmless.
 _harmless: set[tuple[str | int, ...]] = set()
 
 
 def open_vetted_trajectory(path: Path) -> TrajectoryReader:
-    """Open a trajectory like `open_trajectory`, but safely if it is untrusted.
+    """Open a trajectory as `open_trajectory` does, but test untrusted files first.
 
     Raises:
-        UnreadableFile: see `open_trajectory`. This is also raised if the file is
-            untrusted and harms the process that reads it first.
+        UnreadableFile: see `open_trajectory`. This is also raised if the limited
+            process fails to read an untrusted file.
     """
     if is_finished(path) and not (is_inside() or is_own_directory(path.parent)):
         found = file_of(path).stat()
@@ -88,8 +88,8 @@ def compile_sources(
 
     Args:
         path: the zip file.
-        compiled_size: size of the model in bytes when it was recorded. It determines
-            how much memory compiling may take.
+        compiled_size: the recorded size of the compiled model in bytes, which
+            determines the memory limit.
         seconds: the time limit.
 
     Raises:
@@ -109,7 +109,7 @@ def compile_sources(
 def _done(
     task: str, path: Path, limits: dict[str, int], seconds: float
 ) -> Iterator[Path]:
-    """Run a task on a file in a limited process, and yield its output directory.
+    """Run a task on a file in a limited process, and yield the output directory.
 
     Raises:
         UnreadableFile: the task failed or took too long.
@@ -133,7 +133,7 @@ def _done(
             raise UnreadableFile(
                 path,
                 answer.get("reason")
-                or f"the process that had to {task} it {sandbox.last_words()} (its "
+                or f"the process that tried to {task} it {sandbox.last_words()} (the "
                 f"memory limit is {limits['RLIMIT_DATA'] / _GIB:.1f} GiB)",
             )
         yield Path(place)
@@ -152,7 +152,7 @@ def main() -> int:
 
 
 def _read(path: Path) -> None:
-    """Read everything in a trajectory, in the same way as a normal reader."""
+    """Read a whole trajectory, as a normal reader would."""
     with open_trajectory(path) as reader:
         together = (
             reader.states(0, reader.row_count),

@@ -43,19 +43,19 @@ def new_context() -> Any:
     context current again, with `context_kept`.
 
     Raises:
-        GLError: no context can be created here, or this process was forked from one
-            that had created contexts.
+        GLError: no context can be created here, or this process was forked from a
+            process that had created contexts.
     """
     global _has_made_context
     refuse_fork_of_gl()
     try:
-        # mujoco's own class frees a context on whichever thread drops it.
+        # mujoco's own class frees a context on the thread that last referred to it.
         owned = {"__del__": lambda context: None}
         kind: Any = type("OwnedGLContext", (_context_class(),), owned)
         context = kind(_WINDOW_SIDE, _WINDOW_SIDE)
         _has_made_context = True
         context.make_current()
-        # Not every mujoco context imports PyOpenGL, which the facts need.
+        # Not every mujoco context imports PyOpenGL, which `current_gl_facts` needs.
         raw_opengl()
         works = bool(current_gl_facts())
     except Error:
@@ -65,17 +65,17 @@ def new_context() -> Any:
         raise gl_error("No OpenGL context can be created", reason) from error
     if not works:
         # GLFW without a display creates an object that does nothing.
-        raise gl_error("No OpenGL context can be created", "nothing draws into it")
+        raise gl_error("No OpenGL context can be created", "it cannot be drawn to")
     return context
 
 
 def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
-    """Return the error for something that OpenGL cannot do here.
+    """Return the error for a failed OpenGL operation.
 
     Args:
         what: what failed, as a clause.
         reason: the message from mujoco or the driver.
-        remedy: a sentence on what to try before `mjrec doctor`.
+        remedy: a sentence that suggests a remedy to try before `mjrec doctor`.
     """
     backend = os.environ.get("MUJOCO_GL")
     setting = "unset" if backend is None else repr(backend)
@@ -94,7 +94,7 @@ def raw_opengl() -> Any:
     `OpenGL.GL` is not used, because its import takes longer than drawing a frame.
     """
     # PyOpenGL chooses its platform on import, and mujoco sets the platform when it
-    # imports its context class. So it must not be imported before a context exists.
+    # imports its context class. So do not import PyOpenGL before a context exists.
     return importlib.import_module("OpenGL.raw.GL.VERSION.GL_1_0")
 
 
@@ -108,7 +108,7 @@ def current_gl_facts() -> dict[str, Any]:
     CUDA's device number is not queried, because that would initialize CUDA in a process
     that may belong to another library and be forked later.
     """
-    # Code that has drawn has already imported PyOpenGL, which must not happen here.
+    # If a context exists, PyOpenGL has been imported. Do not import it here.
     if "OpenGL.platform" not in sys.modules:
         return {}
     gl = raw_opengl()
@@ -134,10 +134,10 @@ def current_gl_facts() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def context_kept(*, or_none: bool = False) -> Iterator[None]:
-    """After the block, restore the context that was current before it.
+    """Restore, after the block, the context that was current before it.
 
-    This works only with EGL. The other backends cannot make another library's context
-    current: with them, the block's context stays current.
+    This works only with EGL. Other backends cannot make another library's context
+    current, so the block's context stays current.
 
     Args:
         or_none: whether to end without a current context if there was none before. If
@@ -195,7 +195,7 @@ os.register_at_fork(after_in_child=_note_fork)
 
 
 def _current_in_egl() -> tuple[Any, ...] | None:
-    """Return the arguments that would make the current context current again."""
+    """Return the arguments of `eglMakeCurrent` that restore the current context."""
     # If there is a context, PyOpenGL has been imported.
     egl = sys.modules.get("OpenGL.EGL")
     if egl is None or not (context := egl.eglGetCurrentContext()):

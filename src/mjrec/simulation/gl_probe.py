@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program of a child process that tests one OpenGL backend.
 
-The child imports mujoco with the backend in `MUJOCO_GL`, draws a scene, checks the
-frame, and sends each result to its parent at once. So no result is lost if the driver
-crashes afterwards.
+The child imports mujoco with the backend in `MUJOCO_GL`, draws a scene, and checks the
+frame. It sends each result to its parent immediately, so no result is lost if the
+driver crashes afterwards.
 
 ::
 
@@ -11,7 +11,7 @@ crashes afterwards.
     {"error": "ImportError: ..."}                 the backend does not render, or
     {"renders": true, "gl_renderer": ..., ...}    it renders
     {"frames_per_second": 16.2}                   with --measure
-    {"devices": [...]}                            always with EGL, if it lists them
+    {"devices": [...]}                            with EGL, if it lists any
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _SMALL = 96
 _MEASURED_SECONDS = 0.8
 _MEASURED_FRAMES = 200
 
-# The colours are purely emissive, so their pixels do not depend on the light. The floor
-# and the shadows cost as much as in a normal scene.
+# The colored geoms are purely emissive, so their pixels do not depend on the light. The
+# floor and the shadows take as long to draw as in a normal scene.
 _SCENE = """
 <mujoco>
   <asset>
@@ -63,7 +63,7 @@ _SCENE = """
 </mujoco>
 """
 
-# A pixel's (row, column) as fractions of height and width, and its expected colour.
+# A pixel's (row, column) as fractions of height and width, and its expected color.
 _EXPECTED = {
     "red on the left": ((0.62, 0.23), (255, 0, 0)),
     "blue on the right": ((0.62, 0.77), (0, 0, 255)),
@@ -73,14 +73,14 @@ _TOLERANCE = 40
 
 
 class WrongFrame(Exception):
-    """A frame was drawn but does not show what it should."""
+    """A frame was drawn but does not show the expected scene."""
 
 
 def check_frame(frame: np.ndarray) -> None:
     """Check that `frame` shows the probe's scene.
 
     Raises:
-        WrongFrame: the frame has a single colour, or a colour is in the wrong place.
+        WrongFrame: the frame has a single color, or a color is in the wrong place.
     """
     if np.ptp(frame.reshape(-1, 3), axis=0).max() == 0:
         colour = tuple(frame[0, 0].tolist())
@@ -90,7 +90,7 @@ def check_frame(frame: np.ndarray) -> None:
         pixel = frame[int(row * height), int(column * width)]
         if np.abs(pixel.astype(int) - colour).max() > _TOLERANCE:
             raise WrongFrame(
-                f"The frame should show {name}, but that pixel is "
+                f"The frame should show {name}, but the pixel there is "
                 f"{tuple(pixel.tolist())}."
             )
 
@@ -111,8 +111,8 @@ def draw_test_scene(
         A function that draws the scene again, and metadata about the driver.
 
     Raises:
-        WrongFrame: the frame does not show what it should.
-        Exception: any other error; drivers raise all kinds of errors.
+        WrongFrame: the frame does not show the expected scene.
+        Exception: any other error, because drivers may raise any type.
     """
     # Imported here because these imports are part of the test.
     import mujoco
@@ -143,8 +143,8 @@ def main() -> None:
             parent.send(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Any error is a result.
         parent.send(notes=list(_notes(backend)), error=_text_of(error))
-    # This comes last, because querying CUDA's numbers initializes CUDA, which may fail
-    # or hang.
+    # This comes last, because querying CUDA's device numbers initializes CUDA, which
+    # may fail or hang.
     if backend == "egl":
         used = facts.get("gl_device", {}).get("index")
         devices = [
@@ -197,7 +197,7 @@ def _load(library: str) -> str:
 
 
 def _vendor_notes() -> Iterator[str]:
-    """Yield notes about the drivers that libEGL finds by its own rules."""
+    """Yield notes about the drivers that libEGL would find."""
     names = os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES", "")
     directories = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", "") or _VENDOR_DIRECTORIES
     files = (

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes in a model and its view, found by comparing memory.
 
-Comparing some 500 arrays one by one takes longer than a simulation step. But all of
-them are in one allocation, and the structs `opt`, `vis` and `stat` follow one another
-in `mjModel` itself. So comparing a few long pieces is enough to show that nothing has
+Comparing some 500 arrays one by one takes longer than a simulation step. But all arrays
+are in one allocation, and the structs `opt`, `vis` and `stat` follow one another in
+`mjModel` itself. So comparing a few long pieces is enough to show that nothing has
 changed, which is the usual case. Only a piece that differs is examined field by field.
 """
 
@@ -21,8 +21,8 @@ from .fields import array_names, member_names, read_fields, struct_names
 from .raw_memory import address_of, raw_memory
 from .view import SceneView
 
-# The arrays that each frame is drawn from. These are whole groups, because a few long
-# pieces are compared faster than the exact arrays. Other arrays are compared at resets.
+# The groups of arrays that each frame is drawn from. Comparing a few long pieces is
+# faster than comparing only the necessary arrays. Other arrays are compared at resets.
 _DRAWN = (
     *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "actuator_cranklength"),
     *("skin_matid", "skin_group", "skin_rgba", "skin_inflate"),
@@ -30,23 +30,23 @@ _DRAWN = (
 )
 
 # Numbers of bytes in a camera and an option before the first and after the last array.
-# Memory beyond belongs to other objects and may change at any time, so it is not
-# compared.
+# Memory outside this range belongs to other objects and may change at any time, so it
+# is not compared.
 _REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
 
 _Arrays = list[tuple[str, NDArray[Any]]]
 
 
 class Looks:
-    """The remembered fields of a model and a view, for finding those that have changed.
+    """A record of the fields of a model and a view, for finding the changed fields.
 
     At a reset, all fields of the model are compared. Between resets, only the fields
-    that each frame is drawn from are compared. Textures and meshes are not among them,
-    because they must be uploaded to the graphics card. The model is only read, and is
-    kept alive.
+    used for each frame are compared. They do not include textures and meshes, which
+    must be uploaded to the graphics card. The model is not modified, and it is kept
+    alive.
 
     Args:
-        model: the model, as it is stored now.
+        model: the model in its currently stored form.
 
     Attributes:
         seen: the watched memory in pieces, as of the last look. `follow` may replace
@@ -68,7 +68,7 @@ class Looks:
         self.present: list[Any] = []
 
     def is_of(self, model: mujoco.MjModel) -> bool:
-        """Return whether `model` is the remembered model, in any wrapper."""
+        """Return whether `model` is, or wraps, the remembered model."""
         # No other model can have this address while this one is kept alive.
         return bool(model._address == self._model._address)
 
@@ -96,7 +96,7 @@ class Looks:
     def since_stored(self) -> dict[str, NDArray[Any]]:
         """Return the model's fields that have changed since this object was created.
 
-        The current values count as seen.
+        The current values become the values of the last look.
         """
         names: list[str] = []
         for piece in (*self._watched, *self._others):
@@ -107,11 +107,11 @@ class Looks:
         """Return the watched fields that have changed since the last look.
 
         Args:
-            anything: whether to compare textures, meshes and so on too.
+            anything: whether to also compare textures, meshes and so on.
 
         Returns:
-            Copies by name, or None if nothing has changed; finding that out takes less
-            than a microsecond.
+            Copies by name, or None if nothing has changed. In that case, the call takes
+            less than a microsecond.
         """
         if not anything and self.seen == self.present:
             return None
@@ -121,10 +121,10 @@ class Looks:
 
 
 class _Piece:
-    """A piece of memory, as it was at the start (`stored`) and the last look (`seen`).
+    """A piece of memory, with its bytes at the start (`stored`) and last look (`seen`).
 
-    Memory that is not watched at each step may be large, so for such memory, the two
-    are one copy until something changes.
+    Memory that is not watched at each step may be large, so the two share one copy of
+    it until something changes.
     """
 
     def __init__(self, address: int, size: int, *, is_watched: bool = True) -> None:
@@ -150,7 +150,7 @@ class _Piece:
         return [] if is_same else self.differing(self.stored)
 
     def see(self) -> None:
-        """Remember the current bytes. `seen` changes in place, as `Looks` shares it."""
+        """Remember the current bytes. `seen` changes in place; `Looks` shares it."""
         if self.seen is self.stored:
             self.seen = bytearray(self.raw)
         else:
@@ -179,7 +179,7 @@ class _ArrayPiece(_Piece):
 
 
 class _StructPiece(_Piece):
-    """Structs, whose members are compared one by one once any byte has changed.
+    """Structs, whose members are compared one by one if any byte has changed.
 
     Args:
         names: the members' names, in the form that `read_fields` takes.
@@ -227,7 +227,7 @@ def _extent(arrays: _Arrays) -> int:
 
 
 def _structs_of(model: mujoco.MjModel) -> _StructPiece:
-    # The structs follow the sizes, and the last member of the last one is an array.
+    # The structs follow the sizes, and the last member of the last struct is an array.
     size = address_of(model.stat.center) + model.stat.center.nbytes - model._address
     return _StructPiece(model._address, size, struct_names(), model=model)
 

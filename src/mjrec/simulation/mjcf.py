@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model from an MJCF file, simulated from frame to frame."""
+"""A model from an MJCF file, simulated frame by frame."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
     """Compile an MJCF file, and return the model.
 
     Raises:
-        UnreadableFile: the file is missing, or MuJoCo rejects it (with its reason).
+        UnreadableFile: the file is missing, or MuJoCo rejects it for the stated reason.
     """
     if path.exists() and not path.is_file():
         # Opening a pipe would block forever.
@@ -47,10 +47,10 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
 class MjcfSimulation:
     """A simulation in whole physics steps, at 60 frames per simulated second.
 
-    Frame k is taken after the whole number of steps that comes closest to k/60 seconds.
+    Frame k is taken after the whole number of steps that is closest to k/60 seconds.
     With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart. A frame is
     never more than half a step off, and errors do not accumulate. If the timestep is
-    longer than 1/60 second, each frame is one step, and the rate is one over the
+    longer than 1/60 second, each frame is one step, and the frame rate is one over the
     timestep.
 
     Args:
@@ -119,7 +119,7 @@ class MjcfSimulation:
         return math.floor(frame / (self.frame_rate * self._timestep) + Fraction(1, 2))
 
     def _trouble(self) -> str | None:
-        # MuJoCo's reset clears older counts, so one of these is set after any bad step.
+        # MuJoCo's reset clears older counts, so any bad step leaves one of these set.
         for warning, quantity in _BAD_STATES.items():
             if self.data.warning[warning].number:
                 index = self.data.warning[warning].lastinfo
@@ -131,7 +131,7 @@ class MjcfSimulation:
 
 
 def _meant_timestep(model: mujoco.MjModel) -> Fraction:
-    """Return the timestep that the author meant: 1/60 for 0.0166667, for example."""
+    """Return the timestep that the author intended: 1/60 for 0.0166667, for example."""
     exact = Fraction(model.opt.timestep)
     steps_a_second = round(1 / exact)
     if abs(exact * steps_a_second - 1) < _ROUNDING:

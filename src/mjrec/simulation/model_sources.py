@@ -9,7 +9,7 @@
     fields/<name>.npy      the fields in which the stored model differs from the
                            compiled sources, because an environment set them
 
-The same content always gives the same bytes. Compiling reads no other files.
+The same content always yields the same bytes. Compiling reads no other files.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
 # A path is composed of several attributes, and each may go up this many levels. The
-# files are compiled deeper than that in an empty directory, so `..` finds nothing.
+# files are compiled at a greater depth in an empty directory, so `..` leads nowhere.
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
@@ -62,7 +62,7 @@ class AuthoredModel:
 
     Attributes:
         main: the name of the MJCF file to compile.
-        files: the content of every file by its name, a relative path with `/`.
+        files: the content of every file, keyed by a relative path with `/`.
     """
 
     main: str
@@ -88,7 +88,7 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
     """Write the sources of `model`, and the fields that were set after compiling.
 
     Raises:
-        ValueError: the sources do not give the same model.
+        ValueError: the sources do not compile to the same model.
     """
     # Some names are like `./meshes/../a.obj`.
     files = {posixpath.normpath(name): data for name, data in authored.files.items()}
@@ -144,7 +144,7 @@ def read_authored(path: Path) -> mujoco.MjModel:
 
 
 def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with all textures embedded, even those it only refers to."""
+    """Return the model with all textures embedded, including those it refers to."""
     # MuJoCo 3.17 introduced such textures. Their address in the model is negative.
     if not hasattr(mujoco, "mj_embedAssets") or not (model.tex_adr < 0).any():
         return model
@@ -174,10 +174,10 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
         references = _References(name, authored.files[name])
         goes_up |= references.go_up
         for reference in references.xml:
-            # Removed, so that no file is checked twice, however often it is named.
+            # Removed, so that no file is checked twice, even with several references.
             waiting += by_base_name.pop(PurePosixPath(reference).name, [])
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        # Only if needed: so many folders take longer than compiling most models.
+        # Only if needed: creating the folders takes longer than most compilations.
         root = Path(directory) / _EMPTY if goes_up else Path(directory)
         for name, content in authored.files.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -187,12 +187,12 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """The files that one MJCF file refers to, by the names in that file.
+    """The files that one MJCF file refers to, under the names used in it.
 
     Attributes:
         xml: other MJCF files.
         assets: all other files.
-        directories: the directories in which the other files are looked up.
+        directories: the directories to search for the other files.
         go_up: whether a path leaves a folder with `..`.
 
     Raises:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of the recordings in a directory, each stored once.
+"""The models used in a directory's recordings, each stored once.
 
 ::
 
     directory/
-    ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model, exactly
+    ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model as is
     └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
-The digits are the first ones of the compiled model's sha256. Only the MuJoCo version
+The digits are the beginning of the compiled model's SHA-256. Only the MuJoCo version
 that compiled a model can load it. The zip file is for all other versions, and for all
-users except the one who stored the model (see `model_trust`).
+users other than the user who stored the model (see `model_trust`).
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from .model_sources import AuthoredModel, with_embedded_files, write_authored
 logger = logging.getLogger(__name__)
 
 # For dm_control's humanoid (11.8 MB), level 1 gives 686 KB in 37 ms, level 3 529 KB in
-# 42 ms, level 6 323 KB in 112 ms. This time is taken from a CPU that also renders.
+# 42 ms, level 6 323 KB in 112 ms. The CPU that compresses is also needed for rendering.
 _LEVEL = 3
 _CHUNK = 1 << 20
 
-# No recorded model comes near this size; a file that claims more was made to do harm.
+# No real model comes near this size. A file that claims a larger size is malicious.
 _LARGEST = 1 << 31
 
 _NAME = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(mjb\.gz|zip)")
@@ -56,7 +56,7 @@ class _Job(NamedTuple):
 
 
 class ModelStore:
-    """A store of models next to recordings, written in a background thread.
+    """A store for the models of recordings, written in a background thread.
 
     Files appear complete or not at all, and existing files are never rewritten. So any
     number of processes may store models in one directory.
@@ -74,12 +74,12 @@ class ModelStore:
     def add(
         self, model: mujoco.MjModel, authored: AuthoredModel | None = None
     ) -> dict[str, Any]:
-        """Store a model as it is now. Another thread writes it.
+        """Store a copy of a model. Another thread writes it.
 
         Args:
             model: the model; it is not modified, and it is not used after this call.
             authored: the model's sources. The model may differ from them in the values
-                of its fields, but not in its structure. If its structure differs, the
+                of its fields, but not in its structure. If the structure differs, the
                 sources are not stored, and the file named by `xml` will not exist.
 
         Returns:
@@ -109,10 +109,10 @@ class ModelStore:
         }
 
     def finish(self) -> None:
-        """Wait until every model is stored. More models may be added afterwards.
+        """Wait until every model is stored. Additional models may be added afterwards.
 
         Raises:
-            FileNotWritten: a model could not be stored. The next call retries it.
+            FileNotWritten: a model could not be stored. The next call tries again.
         """
         self.settle()
         failed, self._failed = self._failed, []
@@ -122,7 +122,7 @@ class ModelStore:
             raise self._failed[0][1]
 
     def settle(self) -> None:
-        """Wait until no model is left to be stored; `finish` reports any failures."""
+        """Wait until no model is left to store; `finish` reports any failures."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
@@ -160,7 +160,7 @@ def load_model(
         directory: the recording's directory.
         facts: the facts that `ModelStore.add` returned.
         trust_models: whether to load an untrusted compiled model. MuJoCo does not check
-            its content, so a crafted model can run any code.
+            its content, so a crafted model can run arbitrary code.
 
     Raises:
         UnreadableFile: the files are missing or damaged, do not match the facts, or
@@ -188,7 +188,7 @@ def load_model(
 
 
 def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
-    """Return a model as `mj_saveModel` writes it, with its textures embedded."""
+    """Return a model in the format of `mj_saveModel`, with its textures embedded."""
     whole = with_embedded_files(model)
     buffer = np.empty(mujoco.mj_sizeModel(whole), np.uint8)
     mujoco.mj_saveModel(whole, None, buffer)
@@ -202,7 +202,7 @@ def _write(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
-    # The header has no name and no time, so the same model always gives the same file.
+    # The header has no name or time, so the same model always yields the same file.
     with (
         path.open("wb") as file,
         gzip.GzipFile(
@@ -277,8 +277,8 @@ def _loaded(content: bytes) -> mujoco.MjModel:
 def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
     return UntrustedModel(
         compiled,
-        "it was not written by this user on this machine, and a crafted model can run "
-        "any code in the process that loads it; its sources "
+        "it was not written by this user on this machine. A crafted model can run "
+        "any code in the process that loads it, and this model's sources "
         f"{what_of_sources}. If you trust its author, use `mjrec render "
         "--trust-models`, mjrec.load_trajectory(path, trust_models=True), or the "
         f"environment variable {model_trust.TRUST_VARIABLE}=1",
@@ -288,18 +288,18 @@ def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
 def _not_loadable(directory: Path, facts: Mapping[str, Any]) -> UnreadableFile:
     name, version = facts.get("mjb") or facts.get("xml"), facts.get("mujoco")
     if name is None:
-        return UnreadableFile(directory, "the recording does not name its model")
+        return UnreadableFile(directory, "the recording lacks the name of its model")
     if version == mujoco.__version__:
         return UnreadableFile(
             directory / name,
-            "the recording's model is missing; copy it from the directory that was "
-            "recorded",
+            "the recording's model is missing; copy it from the directory of the "
+            "original recording",
         )
     source = facts.get("xml")
     return UnreadableFile(
         directory / name,
-        f"the model was written by mujoco {version}, but this is mujoco "
-        f"{mujoco.__version__}, and the model's sources are missing. Install that "
-        f"version: pip install mujoco=={version}"
-        + (f"; or put {source} next to it" if source else ""),
+        f"the model requires mujoco {version}, but the installed version is "
+        f"{mujoco.__version__}, and the model's sources are missing. Install the "
+        f"required version: pip install mujoco=={version}"
+        + (f"; or copy {source} to this directory" if source else ""),
     )

@@ -2,22 +2,22 @@
 """The list of compiled models that this user has stored; no other models are loaded.
 
 MuJoCo trusts the addresses and types in a compiled model, so loading a crafted model
-can run any code. The hashes in a directory prove nothing, because its author wrote them
-too. So the models that this user stores are listed where only this user can write::
+can run any code. The hashes in a directory prove nothing, because anyone can write
+them. So the models that this user stores are listed where only this user can write::
 
     $XDG_STATE_HOME/mjrec/models       the sha256 of each model and of the path of its
                                        directory, one per line
     ~/.local/state/mjrec/models        by default
     <temporary directory>/mjrec-<uid>/models       if that is not writable
 
-A list that others can open is neither used nor replaced, because only its owner knows
-what they wrote. Until its permissions are fixed, new models are listed in the other
-place.
+A list that others can open is neither used nor replaced, because only its owner can
+judge its content. Until its permissions are fixed, new models are listed in the other
+location.
 
 A list that reaches 65,536 lines becomes `models.old` and replaces the previous
 `models.old`, whose models are then no longer trusted.
 
-Workers on other machines may have different home directories. They are sent the hashes
+Workers on other machines may have different home directories. They receive the hashes
 that their jobs need, and list them as their own. They report the models that they
 store, and the machine that sent the job lists these models.
 
@@ -65,7 +65,7 @@ def note_models(digests: Iterable[str]) -> None:
     If no list can be written, a warning is logged.
 
     Args:
-        digests: the sha256 of the compiled models, in hex.
+        digests: the SHA-256 hashes of the compiled models, in hex.
     """
     wanted = list(dict.fromkeys(digests))
     noting = _noting.get()
@@ -113,10 +113,10 @@ def is_stored(digest: object) -> bool:
 
 
 def directory_digest(directory: Path) -> str:
-    """Return the digest with which `note_models` lists a directory.
+    """Return the digest that represents a directory in the list of models.
 
     The digest identifies the directory by its path. A directory that was moved or
-    copied is untrusted, which costs only a moment.
+    copied is untrusted, which only slows down reading.
     """
     place = f"directory {os.path.realpath(directory)}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
@@ -168,7 +168,7 @@ def _warn_once(message: str) -> None:
 
 
 def _directories() -> Iterator[Path]:
-    """Yield the possible directories for a list, starting with the best."""
+    """Yield the possible directories for a list, best first."""
     state, home = os.environ.get("XDG_STATE_HOME", ""), os.path.expanduser("~")  # noqa: PTH111  `Path.home` raises for users without one
     # The XDG specification says to ignore relative paths.
     if state.startswith("/"):
@@ -203,7 +203,7 @@ def _listed() -> str:
 
 
 def _append(directory: Path, digests: Iterable[str]) -> None:
-    """Append to the list in a directory, creating it if necessary.
+    """Append to the list in a directory, creating the list if necessary.
 
     Raises:
         OSError: the list cannot be written, or others can open it.
@@ -238,8 +238,8 @@ def _opened(path: Path, flags: int) -> Iterator[int]:
 
 
 def _check(path: Path, facts: os.stat_result, kind: int, *, mode: int) -> None:
-    """Raise PermissionError if others may have written to a path."""
+    """Raise PermissionError if other users may have written to a path."""
     if stat.S_IFMT(facts.st_mode) != kind or facts.st_uid != os.geteuid():
         raise PermissionError(f"{path} belongs to another user, or is a link or pipe")
     if facts.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise PermissionError(f"{path} is open to others (chmod {mode} {path})")
+        raise PermissionError(f"{path} is open to other users (chmod {mode} {path})")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access to a simulation's memory, for gathering or comparing many arrays at once.
+"""Access to a simulation's memory, for gathering or comparing many arrays together.
 
-The arrays of an `MjData` keep their addresses as long as it lives, and so do our own
-arrays. `WORDS` presents the whole memory of this process as one long array of 64-bit
-words. `WORDS.take(index, None, out, "clip")` gathers a row from it, at a tenth of the
-cost of copying each array. Only the words in an index are ever touched.
+The arrays of an `MjData` keep their addresses as long as it exists, and so do our own
+arrays. `WORDS` represents the whole memory of this process as one long array of 64-bit
+words. `WORDS.take(index, None, out, "clip")` gathers a row from it in a tenth of the
+time needed to copy each array. Only the indexed words are ever read.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def raw_memory(address: int, size: int) -> Any:
 
 
 def words_of(arrays: Iterable[NDArray[Any]]) -> NDArray[np.intp]:
-    """Return the indices into `WORDS` of all arrays, concatenated.
+    """Return the concatenated indices of all arrays in `WORDS`.
 
     Args:
         arrays: arrays for which `can_be_gathered` returns True. The caller must keep

@@ -25,10 +25,10 @@ _MODEL, _STATES = "model.mjb", "states.npy"
 
 
 class RecordedScene:
-    """A model and its data, as they were at a frame of a trajectory.
+    """A model and its data, restored to a frame of a trajectory.
 
     Frames are restored in ascending order. Only arrays that the visualizer reads are
-    restored, so use the data only to draw.
+    restored, so use the data only for drawing.
 
     Args:
         reader: the trajectory's reader, which must stay open as long as this object is
@@ -43,8 +43,8 @@ class RecordedScene:
         data: the model's data at that frame.
         view: the environment's view of the scene. Its camera and option change with the
             frames.
-        previous_cameras: positions of the two cameras of the environment's scene before
-            the first frame, `(2, 3)`.
+        previous_cameras: positions of the environment scene's two cameras before the
+            first frame, `(2, 3)`.
         count: number of frames.
         is_constant: whether the model and view are the same in all frames.
     """
@@ -64,7 +64,7 @@ class RecordedScene:
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             raise UnreadableFile(reader.path, f"in its scene: {error}") from error
         if not isinstance(facts.get("model"), dict):
-            raise UnreadableFile(reader.path, "it does not name its model")
+            raise UnreadableFile(reader.path, "the name of its model is missing")
         self.model = load_model(reader.path.parent, facts["model"])
         self.data = mujoco.MjData(self.model)
         self.count = reader.frame_count
@@ -82,10 +82,10 @@ class RecordedScene:
         """Restore frame `index`, from 0 to `count` - 1.
 
         Returns:
-            Whether any model field changed that an OpenGL context keeps.
+            Whether a model field that an OpenGL context keeps has changed.
 
         Raises:
-            UnreadableFile: the file is damaged, or does not fit its model.
+            UnreadableFile: the file is damaged, or does not match its model.
         """
         try:
             changed = self._change_model(int(self._reader.frame_steps[index]))
@@ -124,7 +124,7 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
     """Return `states` as an `(n, size)` array of float64.
 
     Args:
-        model: a `mujoco.MjModel`, or dm_control's wrapper of one.
+        model: a `mujoco.MjModel`, or dm_control's wrapper around one.
         states: one row per state.
         spec: the components of a row, a combination of `mujoco.mjtState` flags.
 
@@ -145,8 +145,8 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
     if rows.ndim == 3 and rows.shape[2] == size:
         raise InvalidArgument(
             f"States must have the shape (n, {size}), but this array has the shape "
-            f"{rows.shape}: many runs of many steps, as mujoco.rollout returns them. "
-            "Pass one run, states[k], or all runs one after another, "
+            f"{rows.shape}, like the runs returned by mujoco.rollout. "
+            "Pass a single run, states[k], or all runs concatenated, "
             f"states.reshape(-1, {size})."
         )
     if rows.ndim != 2 or rows.shape[1] != size:
@@ -174,18 +174,18 @@ def save_states(directory: Path, model: Any, states: NDArray[np.float64]) -> Non
 
 
 class GivenStates:
-    """A model and its data in one of the states that `save_states` has written.
+    """A model and its data in one of the states that `save_states` wrote.
 
-    All quantities derived from a state are computed with `mj_forward`. Components that
-    are not in the rows are as in a new `MjData`. So each frame depends only on its row.
+    All quantities derived from a state are computed with `mj_forward`. Components
+    missing from the rows are as in a new `MjData`, so a frame depends only on its row.
 
     Args:
-        directory: the directory that `save_states` wrote to.
+        directory: the directory to which `save_states` wrote.
         spec: the components of a row.
 
     Attributes:
         model: the model.
-        data: the model's data, in the state that was set last.
+        data: the model's data, in the most recently set state.
         count: number of rows.
     """
 
@@ -200,7 +200,7 @@ class GivenStates:
         self.count = len(self._states)
 
     def bring_to(self, index: int) -> bool:
-        """Set a row in the data, and return False because the model never changes."""
+        """Write row `index` into the data. Return False: the model never changes."""
         mujoco.mj_resetData(self.model, self.data)
         # Copied, because mujoco 3.3 does not accept a read-only array.
         state = np.array(self._states[index])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of a simulation from our own renderer, independent of the environment's."""
+"""A renderer for frames of a simulation, independent of the environment's renderer."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 _DRAFT_SHADOW_MAP = 1024
 _MAX_RENDERBUFFER_SIZE = 0x84E8
 
-# Most of a model is read again for every frame. These fields were copied to the
-# graphics card, or compiled into a display list, when the context was created.
-# tex_colorspace is missing from some versions of mujoco.
+# Most of a model is read again for every frame. These fields are copied to the graphics
+# card, or compiled into a display list, when the context is created. tex_colorspace is
+# missing from some versions of mujoco.
 _KEPT = (
     *("hfield_data", "hfield_size"),
     *("tex_data", "tex_type", "tex_width", "tex_height", "tex_nchannel"),
@@ -58,8 +58,8 @@ class Canvas:
     context's copy of the model is up to date.
 
     Args:
-        is_alone: whether nothing else draws in this process, so that the context can
-            stay current on its thread.
+        is_alone: whether no other code draws in this process; the context then stays
+            current on its thread.
 
     Attributes:
         gl_facts: metadata about the driver; see `current_gl_facts`.
@@ -87,7 +87,7 @@ class Canvas:
     def prepare(
         self, model: mujoco.MjModel, *, height: int, width: int, quality: str
     ) -> None:
-        """Prepare for scenes of a model.
+        """Prepare the context for drawing scenes of a model.
 
         Raises:
             InvalidArgument: the driver cannot draw frames of this size.
@@ -122,7 +122,7 @@ class Canvas:
             self._kept = kept
 
     def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Return the frame of `scene`, starting with the top row.
+        """Draw `scene`, and return the frame, with the top row first.
 
         Raises:
             ClosedError: after `close`.
@@ -146,7 +146,7 @@ class Canvas:
                 context.free()
 
     # Without this, MuJoCo would free its objects in whichever context is then current,
-    # and so delete that context's objects with the same numbers.
+    # and so delete objects of that context that have the same numbers.
     __del__ = close
 
     @contextlib.contextmanager
@@ -166,10 +166,10 @@ class Canvas:
             yield
 
     def _load(self, model: mujoco.MjModel) -> None:
-        """Copy into the context the parts of a model that it keeps."""
+        """Copy a model to the context, which keeps parts of it."""
         height, width = self._rectangle.height, self._rectangle.width
         with self._current():
-            # The longest side that the driver can draw.
+            # The longest side that the driver supports.
             limits = np.zeros(1, np.int32)
             gl_context.raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
             limit = int(limits[0])
@@ -180,11 +180,11 @@ class Canvas:
                     f"{limit}x{limit}."
                 )
             self._free_drawing()
-            # Only the context needs these settings, and it keeps no reference to them.
+            # Only the context needs these settings. It keeps no reference to the copy.
             for_context = _with_settings(model, height, width, self._quality)
             # Shadows and fog are scaled by the extent that the context was created
-            # with. The environment's context does not follow a change, and workers
-            # would notice it at different frames.
+            # with. The environment's context ignores later changes, and workers would
+            # see them at different frames.
             for_context.stat.extent = self._extent
             try:
                 self._drawing = mujoco.MjrContext(
@@ -207,17 +207,17 @@ class Canvas:
 class SceneRenderer:
     """A renderer whose frames equal those of `mujoco.Renderer`, byte for byte.
 
-    It does not disturb anything else that draws on the caller's thread, and modifies
+    It does not disturb other code that draws on the caller's thread, and modifies
     neither the model nor the data.
 
-    Most changes to the model show in the next frame. Changes to height fields,
-    textures, meshes, sizes of planes, textures of materials, fog and rendering quality
-    show only after `model_changed`.
+    Most changes to the model take effect in the next frame. Changes to height fields,
+    textures, meshes, plane sizes, material textures, fog and rendering quality take
+    effect only after `model_changed`.
 
     MuJoCo's visualizer remembers the previous frame: an infinite plane is drawn around
     the cameras' positions in that frame, and a camera that tracks a body moves part of
-    the way toward the body in each frame. `look` brings the renderer to a later frame
-    as if all previous frames had been drawn.
+    the way toward the body in each frame. `look` updates this memory as if the frame
+    had been drawn.
 
     ::
 
@@ -231,9 +231,9 @@ class SceneRenderer:
         camera: the camera; see `resolve_camera`. An `MjvCamera` is read again for every
             frame.
         scene_option: the visual options, read again for every frame; None for MuJoCo's
-            default. This is not dm_control's default, which draws no range finders.
-        max_geom: maximum number of geoms in the scene; further geoms are not drawn. The
-            environments' own renderers have different limits (Gymnasium's is 1000).
+            default. dm_control's default differs, because it draws no range finders.
+        max_geom: maximum number of geoms in the scene; additional geoms are not drawn.
+            The environments' own renderers have different limits (Gymnasium's is 1000).
         quality: `"full"` uses the model's own settings. `"draft"` draws without
             multisampling and with a shadow map of at most 1024x1024.
         fresh: whether to draw each frame as if it were the first, as dm_control does.
@@ -241,7 +241,7 @@ class SceneRenderer:
             may take turns with it. None means a new canvas.
         begins_at: positions of the scene's two cameras before the first frame,
             `(2, 3)`.
-        is_moved: whether the camera is moved from outside before each frame.
+        is_moved: whether other code moves the camera before each frame.
 
     Attributes:
         size: `(height, width)` of the frames.
@@ -251,8 +251,8 @@ class SceneRenderer:
         UnknownName: the model has no such camera, or the quality is unknown.
         InvalidArgument: the camera's number or the size is invalid, or the driver
             cannot draw this size.
-        GLError: no OpenGL backend works here, or this process was forked from one that
-            had used OpenGL.
+        GLError: no OpenGL backend works here, or this process was forked from a process
+            that had used OpenGL.
     """
 
     def __init__(
@@ -328,7 +328,7 @@ class SceneRenderer:
         """Bring the canvas up to date with the model.
 
         This compares the parts of the model that an OpenGL context keeps, and copies
-        them again if any has changed. With large textures, it takes milliseconds.
+        them again if any has changed. This takes milliseconds with large textures.
 
         Raises:
             GLError: see `render`.
@@ -366,7 +366,7 @@ def _kept_of(model: mujoco.MjModel) -> bytes:
 def _with_settings(
     model: mujoco.MjModel, height: int, width: int, quality: str
 ) -> mujoco.MjModel:
-    """Return a copy of `model` with a large enough buffer, and the draft settings."""
+    """Return a copy of `model` with settings for frames of this size and quality."""
     changed = copy.copy(model)
     buffer = changed.vis.global_
     buffer.offheight = max(height, buffer.offheight)

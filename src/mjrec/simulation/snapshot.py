@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Snapshots of a simulation, taken as rows of bytes and restored for drawing.
 
-A snapshot that is restored into a new `MjData` gives the same scene, byte for byte.
+A snapshot that is restored into a new `MjData` yields the same scene, byte for byte.
 This is checked during recording, because MuJoCo may read a field that we do not know
 about. Building a scene takes microseconds and needs no OpenGL. So one scene is built
 from the live data and another from the restored snapshot, and they must be equal.
 
 Checking one scene is not enough for plugins. For each scene, MuJoCo calls a plugin's
-`visualize`, which may draw from the plugin's own memory, and may do so only sometimes:
-a touch grid draws nothing until something touches it. So models with plugins are
-recorded live.
+`visualize`, which may draw from the plugin's own memory, but not in every scene: a
+touch grid draws nothing until something touches it. So models with plugins are recorded
+live.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .view import SceneView
 # Arrays of indices into the geoms and into each other, which the visualizer does not
 # check.
 _PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
-# This value replaces the index of a geom.
+# This value takes the place of a geom's index.
 _PULLEY = -2
 
 _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
@@ -53,8 +53,8 @@ class SnapshotSource:
         kind: the dtype that `snapshot_dtype` returned for the model.
 
     Attributes:
-        words: the snapshot's indices into `raw_memory.WORDS`; None if the snapshot
-            cannot be gathered, or if it includes arrays that are not the data's own.
+        words: the snapshot's indices in `raw_memory.WORDS`; None if the snapshot cannot
+            be gathered, or if it includes arrays from outside the data.
     """
 
     def __init__(
@@ -93,12 +93,12 @@ class SnapshotSource:
 
 
 class TendonColours:
-    """The colours in which a model's tendons are drawn.
+    """The colors in which a model's tendons are drawn.
 
-    If a spatial tendon is at its limit, MuJoCo blends its colour with the colour of
+    If a spatial tendon is at its limit, MuJoCo blends its color with the color of
     constraints, weighted by the strength of the limit. Tendons with a material or a
-    colour of their own are not blended. The strength is not kept after the step, so the
-    resulting colour is recorded. It is read from a scene that contains only the
+    color of their own are not blended. The strength is not kept after the step, so the
+    resulting color is recorded. It is read from a scene that contains only the
     tendons.
 
     Attributes:
@@ -153,7 +153,7 @@ def check_layout(
         own = array_kind(model if is_colour else data, name)
         if kind[name] != own:
             raise InvalidArgument(
-                f"The snapshots' {name} is {kind[name]}, but here it is {own}. They "
+                f"The snapshots' {name} is {kind[name]}, but it must be {own}. They "
                 "belong to another model or version of MuJoCo."
             )
     held = {*(kind.names or ())}
@@ -163,16 +163,16 @@ def check_layout(
 
 
 def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Restore a snapshot so that `mjv_updateScene` can use the data.
+    """Restore a snapshot into `data` for use with `mjv_updateScene`.
 
     Args:
         row: an element of `TrajectoryReader.snapshots`, whose layout was checked.
-        model: the model. Its tendons' colours are set if `row` has them.
+        model: the model. Its tendons' colors are set if `row` has them.
         data: the model's data.
 
     Raises:
         InvalidArgument: a tendon refers to something that is not in the model, which
-            MuJoCo would not notice.
+            MuJoCo would not detect.
     """
     names = row.dtype.names or ()
     for name in names:
@@ -218,7 +218,7 @@ def scene_difference(
     """
     if model.nplugin:
         return "its plugins may draw from their own memory"
-    # The tendons' own colours are restored into the model.
+    # The tendons' own colors are restored into the model.
     sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
     restored = mujoco.MjData(restored_model)

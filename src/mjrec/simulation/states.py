@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a simulation, and functions that read, set and preserve it.
 
-The state is `mjSTATE_INTEGRATION`: everything that the next step depends on. MuJoCo
-returns it as one vector whose components are identified by bits. The bits have been
-renumbered between releases, so recordings identify components by name.
+The state is `mjSTATE_INTEGRATION`: everything on which the next step depends. MuJoCo
+returns the state as one vector whose components are identified by bits. The bits have
+been renumbered between releases, so recordings identify components by name.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _PREFIX = "mjSTATE_"
 
 # The components whose arrays in `MjData` have different names.
 _STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
-# The time is not an array but a number in the struct, close to this array.
+# The time is a plain number in the struct, close to this array.
 _NEIGHBOUR, _REACH = "energy", 16
 
-# Fields that an environment moves or colours to show a goal or a touch.
+# Fields that an environment changes to mark a goal or a contact.
 _SHOWING = (
     *("site_pos", "site_quat", "site_size", "site_rgba"),
     *("geom_pos", "geom_quat", "geom_size", "geom_rgba"),
@@ -39,7 +39,7 @@ _SHOWING = (
 
 
 def _elementary_bits() -> dict[str, int]:
-    """Return the single bits of `STATE_SPEC` by name, in MuJoCo's order.
+    """Return the individual bits of `STATE_SPEC` by name, in MuJoCo's order.
 
     Combinations of several bits (`mjSTATE_PHYSICS`) are left out.
     """
@@ -57,7 +57,7 @@ STATE_BITS = _elementary_bits()
 
 
 def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
-    """Return the dtype of the state of `model`, in the order of its vector.
+    """Return the dtype of a state of `model`, with components in MuJoCo's order.
 
     Components that are empty for this model, such as `act`, are left out.
     """
@@ -73,14 +73,14 @@ def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 
 
 def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] | None:
-    """Return the indices into `raw_memory.WORDS` of the state of `data`.
+    """Return the indices of the state of `data` in `raw_memory.WORDS`.
 
-    The caller must keep `data` alive. A test ensures that these words equal the result
-    of `mj_getState`, so no header has to be trusted.
+    The caller must keep `data` alive. The words are compared with the result of
+    `mj_getState`, so no MuJoCo header has to be trusted.
 
     Returns:
-        The indices, or None if a component has a different type than in the state
-        (`eq_active`), is new in MuJoCo, or cannot be gathered.
+        The indices, or None if a component's array has another type (`eq_active`), is
+        unknown, or cannot be gathered.
     """
     arrays = []
     for part in state_dtype(model).names or ():
@@ -103,7 +103,7 @@ def _time(data: mujoco.MjData) -> NDArray[np.float64]:
 
 @functools.cache
 def _time_offset() -> int:
-    """Find the offset of the time from its neighbour, by setting the time."""
+    """Find the offset between the time and its neighbor by setting the time."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
     near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
@@ -118,8 +118,8 @@ def state_columns(
     """Return the columns of a recorded row that form a state in this MuJoCo version.
 
     Raises:
-        InvalidArgument: this MuJoCo version does not know a component, or the component
-            has a different length in this model.
+        InvalidArgument: a component is unknown to this MuJoCo version, or has a
+            different length in this model.
     """
     own = columns_of(state_dtype(model))
     if _lengths(parts) == _lengths(own):
@@ -128,18 +128,18 @@ def state_columns(
     if unknown:
         raise InvalidArgument(
             f"The state contains {', '.join(unknown)}, which MuJoCo "
-            f"{mujoco.__version__} does not know. Use the MuJoCo version that recorded "
+            f"{mujoco.__version__} lacks. Use the MuJoCo version that recorded "
             "it, or a later version."
         )
     recorded, here = _lengths(parts), _lengths(own)
     differences = [
-        f"{name} has {recorded.get(name, 0)}, but in this model {here.get(name, 0)}"
+        f"{name} has {recorded.get(name, 0)}, not {here.get(name, 0)} as in this model"
         for name in STATE_BITS
         if recorded.get(name, 0) != here.get(name, 0)
     ]
     raise InvalidArgument(
-        "The state does not belong to this model: its components differ in length "
-        f"({'; '.join(differences)}). Use the model that it was recorded with "
+        "The state does not belong to this model: the components differ in length "
+        f"({'; '.join(differences)}). Use the model that was recorded "
         "(`trajectory.model()`)."
     )
 
@@ -154,10 +154,10 @@ def set_state(
     parts: Mapping[str, slice],
     row: NDArray[np.float64],
 ) -> None:
-    """Set a recorded state in `data`, whichever MuJoCo version recorded it.
+    """Write a recorded state from any MuJoCo version into `data`.
 
-    Quantities derived from the state (positions of bodies, contacts) are not computed.
-    Nothing is set if the state does not fit.
+    Quantities derived from the state (body positions, contacts) are not computed. If
+    the state does not fit, `data` is not changed.
 
     Args:
         model: the model of `data`.
@@ -184,7 +184,7 @@ def enter_state(
     parts: Mapping[str, slice],
     row: NDArray[np.float64],
 ) -> None:
-    """Set the recorded state of a reset in `data`, and compute derived quantities.
+    """Write a reset's recorded state into `data`, and compute derived quantities.
 
     Args:
         model: the model of `data`.
@@ -209,10 +209,10 @@ def turns_by_rk4(model: mujoco.MjModel) -> bool:
 
 
 class PreservedState:
-    """A simulation's state, preserved across a block.
+    """The state of a simulation, preserved across a `with` block.
 
-    After the block, all of the data is restored, and so are the positions, sizes and
-    colours of the model's sites, geoms and bodies. The arrays keep their addresses.
+    After the block, all data is restored, and so are the positions, sizes and colors of
+    the model's sites, geoms and bodies. The arrays keep their addresses.
     """
 
     def __init__(self) -> None:
@@ -226,7 +226,7 @@ class PreservedState:
         Not reentrant.
         """
         if self._model is not model:
-            # Creating an MjData costs as much as a hundred copies.
+            # Creating an MjData takes as long as a hundred copies.
             self._scratch, self._model = mujoco.MjData(model), model
         fields = [getattr(model, name) for name in _SHOWING]
         before = [field.copy() for field in fields]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes that are read back as arrays.
+"""Recorded episodes, read back as arrays.
 
 Reading needs no simulator. MuJoCo is imported only for a model or its data.
 """
@@ -36,8 +36,8 @@ def load_trajectory(
     """Load a recorded episode.
 
     Args:
-        path: the episode's file, `openaigym.trajectory.*.h5`. While the episode runs,
-            or if its process was killed, this file does not exist yet, and the
+        path: the episode's file, `openaigym.trajectory.*.h5`. If the episode is still
+            running, or its process was killed, this file does not exist, and the
             monitor's log is read instead.
         trust_models: whether `model()` and `mjrec.render` may load a compiled model
             that another user or machine wrote. A crafted model can run any code. If
@@ -79,9 +79,9 @@ class Trajectory:
 
     In addition to `ctrl`, the inputs are `qfrc_applied`, `xfrc_applied`, `eq_active`,
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
-    is the input of the environment, which need not be the input of the actuators.
+    is the input to the environment, which may differ from the input to the actuators.
 
-    Snapshots and changes to the model are read on demand, and the rest is in memory.
+    Snapshots and changes to the model are read on demand; all other data is in memory.
 
     Args:
         reader: the file's reader; it may be closed afterwards.
@@ -172,7 +172,7 @@ class Trajectory:
 
     @property
     def complete(self) -> bool:
-        """Whether the episode was recorded to its end."""
+        """Whether the episode was recorded to the end."""
         return bool(self.facts.get("complete", False))
 
     @property
@@ -187,7 +187,7 @@ class Trajectory:
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """The arrays that frames are drawn from, `(F, *shape)`, by their MuJoCo names.
+        """The arrays used to draw frames, `(F, *shape)`, keyed by their MuJoCo names.
 
         Raises:
             UnreadableFile: the file has been removed or is damaged.
@@ -236,7 +236,7 @@ class Trajectory:
                 self.path, "no MuJoCo simulation was found when it was recorded"
             )
         if not isinstance(stored, Mapping):
-            raise UnreadableFile(self.path, "its facts about its model are invalid")
+            raise UnreadableFile(self.path, "its metadata about the model is invalid")
         model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
             # Apply one change at a time, because there may be thousands of changes,
@@ -250,7 +250,7 @@ class Trajectory:
         return model
 
     def set_state(self, data: mujoco.MjData, step: int) -> None:
-        """Set a recorded state in `data`, without computing derived quantities.
+        """Write a recorded state into `data`, without computing derived quantities.
 
         Args:
             data: a `mujoco.MjData` of `model()`.
@@ -289,4 +289,4 @@ def _what_is_in(path: Path) -> str:
     if not names:
         return f"{path} is a {kind} without trajectories."
     shown = listed(names, _SHOWN)
-    return f"{path} is a {kind}. Name one of the trajectories in it: {shown}."
+    return f"{path} is a {kind}. Choose one of its trajectories: {shown}."

@@ -29,10 +29,10 @@ class SceneView:
     """Everything that a frame depends on, except the model and data.
 
     Attributes:
-        camera: the environment's own live camera, or one of ours.
-        option: the visual options, which are the environment's own or ours. They are
-            not always MuJoCo's defaults.
-        max_geom: maximum number of geoms in the scene; further geoms are not drawn.
+        camera: the environment's own live camera, or a camera created by mjrec.
+        option: the visual options, from the environment or from mjrec. They are not
+            always MuJoCo's defaults.
+        max_geom: maximum number of geoms in the scene; additional geoms are not drawn.
         fresh: whether each frame gets a new scene, as in dm_control. In a reused
             scene, an infinite plane is drawn around the camera of the previous frame.
         height: height of the frames in pixels.
@@ -63,7 +63,7 @@ class SceneView:
 
 
 def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
-    """Return the view that `SceneView.facts` described.
+    """Return the view described by the result of `SceneView.facts`.
 
     Raises:
         InvalidArgument: a value is missing or invalid. The facts may come from a file.
@@ -103,7 +103,7 @@ def option_without_rangefinder() -> mujoco.MjvOption:
 
 
 def place_free_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Move a camera to where the model's fields place the free camera now."""
+    """Move a camera to the free camera's pose in the model's current fields."""
     mujoco.mjv_defaultFreeCamera(model, camera)
 
 
@@ -113,10 +113,10 @@ def place_viewer_camera(
     config: Mapping[str, Any] | None,
     camera: mujoco.MjvCamera,
 ) -> None:
-    """Place a camera where a viewer that Gymnasium created now would place its own.
+    """Place a camera where a newly created Gymnasium viewer would place its own.
 
     The camera looks at the median of the current geom positions and stays there. So a
-    viewer that is created later shows a different frame of the same state.
+    viewer that is created later shows the same state from a different position.
 
     Args:
         model: the model.

@@ -20,7 +20,7 @@ def log_mujoco_warnings() -> None:
 
     MuJoCo itself would write `MUJOCO_LOG.TXT` to the working directory. A full scene,
     for example, causes a warning at each frame. Use this only in processes that mjrec
-    starts, because a process can have only one handler.
+    starts, because a process can have only one warning handler.
     """
     warned: set[str] = set()
 
@@ -35,14 +35,14 @@ def log_mujoco_warnings() -> None:
 
 
 def warning_counts(simulation: Any) -> dict[str, int]:
-    """Return the number of MuJoCo warnings in a simulation since its data was reset.
+    """Return the counts of MuJoCo warnings since a simulation's data was last reset.
 
-    When a simulation becomes unstable, MuJoCo resets it together with these counts, and
-    then counts the warning about the instability again.
+    When a simulation becomes unstable, MuJoCo resets its data, including these counts,
+    and then counts the warning about the instability.
 
     Args:
         simulation: an object with the attribute `data`, which is MuJoCo's own object or
-            dm_control's wrapper of it.
+            dm_control's wrapper around it.
 
     Returns:
         The nonzero counts by name, without the prefix `mjWARN_`.
