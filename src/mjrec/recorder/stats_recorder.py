@@ -30,8 +30,8 @@ class StatsRecorder:
         file_prefix: prefix of the file name, `<file_prefix>.stats.json`.
         autoreset: whether the step that ends an episode also starts a new episode.
         env_id: the environment's name, for messages.
-        allow_early_reset: whether a reset in the middle of an episode drops the episode
-            instead of raising `ResetNotAllowed`.
+        allow_early_reset: whether a reset in mid-episode drops the episode instead of
+            raising `ResetNotAllowed`.
 
     Attributes:
         initial_reset_timestamp: time just before the first reset, in seconds since the
