@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a monitor directory, which may be new, resumed, or cleared by force.
+"""Functions that open a monitor directory, which is new, resumed, or cleared.
 
 Opening claims an infix, which then identifies one monitor. The claim is a lock file
 that is created with `O_EXCL` and held with `flock` while the monitor is open. A lock

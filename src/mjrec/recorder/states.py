@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording of the states of an episode or of one part of a clip, one row per step."""
+"""A recorder for the states of an episode or of part of a clip, one row per step."""
 
 from __future__ import annotations
 

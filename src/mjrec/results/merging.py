@@ -30,8 +30,8 @@ class MergedStats(NamedTuple):
     """The episodes of several statistics files, ordered by end time.
 
     Attributes:
-        data_sources: index of each episode's file, which is also an index into
-            `initial_reset_timestamps`.
+        data_sources: index of the file that contains each episode, which is also an
+            index into `initial_reset_timestamps`.
         initial_reset_timestamps: start time of each file's first reset; None if there
             was no reset.
         timestamps: end time of each episode.
@@ -90,7 +90,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     if not kept:
         logger.error("There are no manifests or journals in %s.", directory)
         return None
-    # In the order of the manifests' names, as in gym.
+    # Sort by the names of the manifests, as gym does.
     kept.sort(key=lambda each: f"{each.infix}.manifest.json")
     found = {
         "manifests": [each.path for each in kept],
@@ -111,7 +111,7 @@ def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
 
 
 class _Kept(NamedTuple):
-    """The part of a monitor's results that is kept in memory while merging."""
+    """The part of a monitor's results that is kept in memory during merging."""
 
     infix: str
     path: str
@@ -154,8 +154,8 @@ def _merge(files: Sequence[StatsFile]) -> MergedStats:
 
 
 def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
-    # In files without types, every episode is a training episode. gym noted a type at
-    # each reset, even for episodes that never ended, so there may be too many types.
+    # In files without types, every episode is a training episode. gym recorded a type
+    # at each reset, even for episodes that never ended, so there may be too many types.
     types = (
         itertools.repeat("t") if stats.episode_types is None else stats.episode_types
     )
