@@ -43,13 +43,13 @@ def write_archive(
     archive_file: IO[bytes],
     env_id: str | None = None,
 ) -> None:
-    """Write gym's archive of videos with their metadata.
+    """Write videos and their metadata to an archive in gym's format.
 
     All files are checked and read before the first byte is written.
 
     Args:
         videos: pairs of video path and metadata path, as in
-            `load_results(...)["videos"]`; at most 100 pairs, and no name twice.
+            `load_results(...)["videos"]`; at most 100, all with different names.
         archive_file: a binary file open for writing. It is not closed.
         env_id: the environment's id, for error messages.
 

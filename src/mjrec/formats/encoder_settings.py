@@ -156,7 +156,7 @@ def encoder_settings(
 def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
     """Try an encoding, so that invalid settings fail before any work is done.
 
-    Each encoding is tried once for each ffmpeg binary.
+    Each encoding is tried only once per ffmpeg binary.
 
     Raises:
         EncoderError: ffmpeg cannot encode with these settings.

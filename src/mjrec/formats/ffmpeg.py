@@ -345,7 +345,7 @@ class FfmpegProcess:
         is_ready: Callable[[float], bool],
         state: Callable[[], object] = lambda: None,
     ) -> None:
-        """Wait, and kill the process if there is no progress for too long.
+        """Wait, killing the process if it makes no progress for too long.
 
         Args:
             is_ready: a function that waits for at most the given number of seconds, and

@@ -136,7 +136,7 @@ class JournalWriter:
     def append(self, entry: JournalEntry) -> None:
         """Record a completed episode.
 
-        If its seed or options would make the line 16 MiB or longer, they are written as
+        If the seed or options would make the line 16 MiB or longer, they are written as
         `{"repr": ...}` and truncated.
 
         Raises:
@@ -173,7 +173,7 @@ class JournalWriter:
 
     @property
     def is_behind(self) -> bool:
-        """Whether some lines could not be written yet."""
+        """Whether some lines have not been written yet."""
         return bool(self._unwritten)
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ CUT_BY_KILL = {"complete": False, "reason": KILLED}
 def how_it_ended(
     reader: TrajectoryReader, recording: Recording | None
 ) -> dict[str, Any]:
-    """Derive the facts about an episode's end that were not recorded from its rows.
+    """Derive any missing facts about an episode's end from its rows.
 
     Args:
         reader: the reader of the episode's rows.
@@ -61,7 +61,7 @@ def how_it_ended(
 def missing_line(
     facts: Mapping[str, Any], choice: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
-    """Return the kind and facts of the journal line that the kill prevented.
+    """Return the kind and facts of the journal line that a killed process left out.
 
     Args:
         facts: the facts in the episode's trajectory; empty if there is no trajectory.

@@ -2,8 +2,8 @@
 """Gym's two files for each monitor: the manifest and the statistics.
 
 The manifest, `openaigym.manifest.<infix>.manifest.json`, lists the files that belong to
-one monitor. It is written last, so that every file it lists is complete. Names in it
-are base names: the directory can be moved, and an untrusted manifest cannot point
+one monitor. It is written last, so that every file it lists is complete. It contains
+only base names, so the directory can be moved, and an untrusted manifest cannot point
 outside its own directory.
 
 The statistics, `openaigym.episode_batch.<infix>.stats.json`, have the keys of
@@ -92,7 +92,7 @@ def _pair(value: Any) -> tuple[str, str]:
 
 
 def _details(value: Any) -> Mapping[str, Any]:
-    """Check the facts that gym did not write, where they are used; return all."""
+    """Return the facts that gym did not write, after checking those that mjrec uses."""
     details = mapping(value)
     next_id = field(details, "next_episode_id", optional(integer), default=None)
     if next_id is not None and next_id < 0:

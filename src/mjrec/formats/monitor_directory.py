@@ -397,7 +397,7 @@ def monitor_directories_in(directory: Path) -> list[Path]:
 
 
 def recording_directories(directory: Path) -> list[Path]:
-    """Return the directory if it has recordings, or else its subdirectories with any.
+    """Return a directory if it has recordings, or else its subdirectories that do.
 
     If there are no such subdirectories, the directory itself is returned.
     """

@@ -134,7 +134,7 @@ class SpanLogs:
             self._log = None
 
     def release(self) -> None:
-        """Close the log's files unchanged, because a forked child does not own them."""
+        """Close the log's files without changing them."""
         if self._log is not None:
             self._log.release()
             self._log = None
@@ -369,7 +369,7 @@ class SpanWriter:
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Record how the recording ended, and close its log unless others use it.
+        """Record how the recording ended, and close its log if it is not shared.
 
         Raises:
             FileNotWritten: the disk is full; the event will be written before the
@@ -381,7 +381,7 @@ class SpanWriter:
             self.log.close()
 
     def drop(self) -> None:
-        """Discard the recording's rows, and remove its log unless others use it.
+        """Discard the recording's rows, and remove its log if it is not shared.
 
         Raises:
             FileNotWritten: the disk is full; the event will be written before the

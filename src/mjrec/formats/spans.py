@@ -76,9 +76,9 @@ class Recording:
         row: the number of its first row.
         look: offset of its changes to the model in the `.looks` file.
         stop: one more than the number of its last row; None if it has not ended.
-        following: the first row of the next recording in the log; None if there is
-            none.
-        is_dropped: whether its rows were given up.
+        following: the first row of the next recording in the log; None for the last
+            recording.
+        is_dropped: whether its rows were discarded.
     """
 
     name: str

@@ -137,7 +137,7 @@ class ModelChange:
     Attributes:
         step: the first step that the values apply to; 0 for differences from the stored
             model at the reset.
-        fields: the new values by name. The names are those of `MjModel`'s arrays
+        fields: the new values, keyed by name. The names are those of `MjModel`'s arrays
             (`geom_rgba`), of members of its structs (`opt.gravity`,
             `vis.headlight.ambient`, `stat.extent`), and of parts of the view
             (`camera.lookat`, `option.flags`).
@@ -161,8 +161,8 @@ def check_version(version: int) -> None:
 def added_up(rewards: ArrayLike) -> float:
     """Return the sum of rewards, adding them one by one as a monitor does.
 
-    Other functions give different last bits: from Python 3.12 on, `sum` compensates for
-    rounding errors, and NumPy adds in pairs.
+    Other functions may differ in the last bits: from Python 3.12 on, `sum` compensates
+    for rounding errors, and NumPy adds in pairs.
     """
     values = np.asarray(rewards, np.float64)
     # Add the sum to 0.0, as a monitor does, which turns negative zero into zero.

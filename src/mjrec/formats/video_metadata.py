@@ -160,7 +160,7 @@ def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
 def finished_videos(video: Path) -> list[tuple[str, str]]:
     """Return the names of an episode's finished videos and of their metadata files.
 
-    The first video comes first; it must exist. Its metadata, which is written last,
+    The first video, which must exist, comes first. Its metadata, which is written last,
     lists the videos from additional cameras (`further_videos`). The list is untrusted,
     so only names that belong to this episode are accepted.
 

@@ -101,7 +101,7 @@ class VideoSink:
         self.blank.add(frame)
 
     def finish(self) -> None:
-        """Complete the video. If this is interrupted, call it again to continue.
+        """Complete the video. After an interrupt, call this method again to continue.
 
         Raises:
             Error: see `VideoWriter.close`.

@@ -51,8 +51,8 @@ class VideoWriter:
                 video.write(frame)
 
     By default, the video is H.264 (High profile, yuv420p, bt709), which every browser
-    plays. With the same ffmpeg, the same frames give the same file, byte for byte, on
-    any CPU.
+    plays. With the same ffmpeg, the same frames produce the same file, byte for byte,
+    on any CPU.
 
     An existing file is replaced when the new one is complete. If no frame is written,
     there is no file and no error. If an exception escapes the `with` block, the file is
@@ -277,7 +277,7 @@ def save_video(
     `<prefix>-episode-<episode_index>.mp4` contains the episode if `episode_trigger`
     selects it. `<prefix>-step-<n>.mp4` starts with the frame of step n if
     `step_trigger` selects that step. The first frame belongs to the reset, and the
-    second to step `step_starting_index`. No frame is left out of a file.
+    second to step `step_starting_index`. No frames are left out.
 
     `frames` can be any iterable. With only an episode trigger, it is streamed up to
     `video_length`, and it is not read at all if no video is due. With a step trigger,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reasons why an episode ended early, and a guard that closes at exit at the latest."""
+"""Reasons why an episode ended early, and a guard that ensures closing at exit."""
 
 from __future__ import annotations
 

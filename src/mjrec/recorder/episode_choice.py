@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice, at their beginning, of episodes that get a video or a trajectory."""
+"""The choice of which episodes get a video or a trajectory, made as they begin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EVALUATION = "e"
 
 
 class EpisodeChoice:
-    """Decides at the beginning of an episode what to record, based on the options.
+    """Decides what to record when an episode begins, based on the options.
 
     A user's function is called only once per episode number, even if several resets
     have the same number.

@@ -69,7 +69,7 @@ class Ended(Protocol):
 
     @property
     def success(self) -> bool | None:
-        """Whether the episode was successful; None if the environment does not tell."""
+        """Whether the episode was successful; None if that is not reported."""
 
 
 _E = TypeVar("_E", bound=Ended)

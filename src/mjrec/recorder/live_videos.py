@@ -51,11 +51,11 @@ class LiveVideos:
         return Path(str(self.recorders[0].path))
 
     def begin(self) -> None:
-        """Take the frames of the reset."""
+        """Take the frames for the reset."""
         self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take the frames of a step.
+        """Take the frames for a step.
 
         Args:
             is_there: whether the frames still exist. False if the environment has
@@ -219,7 +219,7 @@ def live_recorder(
         run: the monitored run.
         base_path: path of the video, without the extension.
         frames: the source of the frames.
-        caption: returns the text to write on the current frame, or None.
+        caption: a function that returns the text for the current frame, or None.
         **facts: additional facts for the metadata.
     """
     return VideoRecorder(

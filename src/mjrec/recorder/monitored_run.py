@@ -71,7 +71,7 @@ class RunningEpisode(NamedTuple):
 
 @dataclass
 class Track:
-    """The states of episodes or of clips, which overlap with episodes.
+    """The capture and the logs for either the episodes or the clips of a run.
 
     Attributes:
         logs: the logs for the rows.
@@ -91,7 +91,7 @@ What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker
 
 
 class MonitoredRun:
-    """What all recordings of a run share: its state, and the facts for their files.
+    """The state shared by all recordings of a run, and the facts for their files.
 
     It writes the run's journal. With `on_error="raise"`, the caller raises an error for
     each fault. With `on_error="warn"`, a fault is logged once and listed in the
@@ -122,8 +122,8 @@ class MonitoredRun:
         events: the journal's content so far, including events that could not be written
             because the disk was full.
         trackers: the trackers, which are notified of episodes and finished videos.
-        of_episodes: the states of episodes.
-        of_clips: the states of clips.
+        of_episodes: the track for episodes.
+        of_clips: the track for clips.
         no_video: a disabled recorder for episodes without a video.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that open a monitor directory, which is new, resumed, or cleared.
+"""Functions that open a monitor directory, which may be new, resumed, or cleared.
 
 Opening claims an infix, which then identifies one monitor. The claim is a lock file
 that is created with `O_EXCL` and held with `flock` while the monitor is open. A lock
@@ -44,7 +44,7 @@ def open_directory(
     With `resume`, episode numbers continue after the highest number of all closed or
     dead monitors, or only of those with the same `uid` if it is given. Monitors that
     are still open do not count. With `JOIN`, the files of other monitors are not read,
-    however many there are. The caller then knows that all monitors record the same
+    however many there are. The caller then guarantees that all monitors record the same
     environment, and episodes are numbered from 0. `force` overrides `resume`.
 
     Args:
@@ -124,7 +124,7 @@ def _check_existing(path: Path, options: RecorderOptions, *, env_id: str) -> Non
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
-    """Return the number that follows the highest one of all closed monitors."""
+    """Return the number after the highest episode number of all closed monitors."""
     highest = -1
     for files in monitors_of(path):
         if uid is not None and files.infix.partition(".")[2] != uid:
@@ -158,7 +158,7 @@ def _claim(
     Args:
         path: the directory.
         uid: string to use in the infix instead of the process id. The infix's number
-            then depends on the directory, so that names are the same in any process.
+            then depends on the directory, so that names are the same in every process.
         run: the run's facts.
         looks: whether to look for any file with the infix. Otherwise, only manifests,
             journals and locks are considered. Each monitor leaves at least one of these

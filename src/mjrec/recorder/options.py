@@ -46,8 +46,8 @@ class Statements:
         provenance_after: number of journal lines before the provenance, not counting
             the first line.
         clock: a function that returns the time in seconds since the Unix epoch.
-        faults: the facts of each fault, paired with the number of journal lines before
-            it.
+        faults: the facts about each fault, paired with the number of journal lines
+            before it.
     """
 
     infix: str
@@ -60,7 +60,7 @@ class Statements:
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderOptions:
-    """A monitor's options, which `mjrec.Monitor` describes.
+    """A monitor's options, which are described in `mjrec.Monitor`.
 
     Raises:
         InvalidArgument: a value is invalid.
@@ -280,7 +280,7 @@ class RenderingChoice:
 
 
 def type_of_mode(mode: str | None) -> str:
-    """Return the episode type of a monitor mode: "t" or "e".
+    """Return the episode type for a monitor mode: "t" or "e".
 
     Raises:
         InvalidArgument: the mode does not exist.

@@ -214,7 +214,7 @@ class Recorder:
                 self._write_results()
 
     def note_error(self, error: BaseException) -> None:
-        """Note an exception raised by the environment's step or reset, or by its user.
+        """Note an exception raised by the environment's step or reset or by the caller.
 
         The running episode, if any, is marked with the error, unless a later step
         succeeds. A reset is always allowed afterwards. The environment's state is no
@@ -256,7 +256,7 @@ class Recorder:
         """Record a step that the environment has just taken.
 
         Args:
-            reward: a number or an array of one element.
+            reward: a number, or an array with one element.
             terminated: whether the task ended the episode.
             truncated: whether a limit outside the task ended it.
             frame: False if the environment has already reset itself, so that its frame
@@ -339,7 +339,7 @@ class Recorder:
         anyway: the files stay as SIGKILL would leave them, and recovery completes them.
 
         Raises:
-            EncoderError: the video could not be finished; the rest is written.
+            EncoderError: the video could not be finished. Everything else is written.
             FileNotWritten: the disk is full; the next call tries again.
         """
         if self.closed:
@@ -434,7 +434,7 @@ class Recorder:
         failures.raise_first()
 
     def _leave_recording(self, recording: EpisodeRecording) -> None:
-        """Leave the running episode as it is, as SIGKILL would."""
+        """Leave the running episode in the state in which SIGKILL would leave it."""
         recording.leave()
         # The span may now extend to the log's last row, so the next episode needs a new
         # log.
@@ -454,7 +454,7 @@ class Recorder:
             facts: the facts about the episode's end.
             failures: collects the errors raised here.
             success: whether the environment reports success; None if unknown.
-            take: takes the episode's last frames.
+            take: a function that takes the episode's last frames.
         """
         recording, is_complete = self._recording, facts["complete"]
         assert recording is not None, "there was no reset"
@@ -581,7 +581,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def _leaving_if_interrupted(self) -> Iterator[None]:
-        """Release all files if the block is interrupted; errors propagate."""
+        """Release all files if the block is interrupted, but not after an error."""
         try:
             yield
         except Exception:
@@ -596,7 +596,7 @@ class Recorder:
             raise
 
     def _leave(self) -> None:
-        """Release all files as they are, as the end of this process would."""
+        """Release all files as they are, as if this process had ended."""
         self.closed = self.stats_recorder.closed = True
         self.run.finisher.stop()
         for each in (self._recording, self._clips):

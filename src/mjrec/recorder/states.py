@@ -37,8 +37,8 @@ class StateRecorder:
     ..., where n is the smallest stride that respects `max_fps`, and at the last step.
 
     Errors are handled here. If no more frames can be taken, only the states are
-    recorded from then on. If nothing can be written anymore, the recording ends there;
-    this raises an error unless `on_error` lets the simulation continue.
+    recorded from then on. If nothing can be written anymore, the recording ends there,
+    and an error is raised unless `on_error` lets the simulation continue.
 
     Args:
         run: the monitored run.
@@ -477,8 +477,8 @@ def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, 
 class DeferredVideo:
     """A video that is rendered later, in place of a `VideoRecorder`.
 
-    Its frames are recorded snapshots. Its files are written when the video is rendered,
-    which the monitor's `close` waits for.
+    Its frames are recorded snapshots. Its files are written when the video is rendered.
+    The monitor's `close` waits for that.
 
     Args:
         directory: the video's directory.

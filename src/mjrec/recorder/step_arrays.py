@@ -115,7 +115,7 @@ def step_array(example: Any) -> StepArray | None:
 def action_array(example: Any) -> StepArray | None:
     """Return a buffer for actions like `example`, or None if it is not an array.
 
-    The buffer is the same as from `step_array`, except that arrays of signed integers
+    The buffer is like that from `step_array`, except that arrays of signed integers
     become float64. This is because `[0.5, 0.1]` may follow `[0, 0]`. A single integer
     is a discrete action and remains an integer.
     """

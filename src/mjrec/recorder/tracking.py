@@ -96,11 +96,11 @@ class FinishedVideo:
 class Tracker:
     """Base class for experiment trackers, for `mjrec.Monitor(..., trackers=...)`.
 
-    Override the methods in a subclass. By default they do nothing. A tracker can serve
-    several runs at the same time, such as the runs of a vector environment. Each call
-    therefore includes the run. If a method raises an exception, the error is logged and
-    recorded in the manifest. The tracker then gets no more calls for that run, and the
-    recording continues.
+    Override the methods in a subclass. By default, the methods do nothing. A tracker
+    can serve several runs at the same time, such as the runs of a vector environment.
+    Each call therefore includes the run. If a method raises an exception, the error is
+    logged and recorded in the manifest. The tracker is then not called again for that
+    run, and the recording continues.
     """
 
     def begin(self, run: Run) -> None:

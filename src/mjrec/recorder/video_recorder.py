@@ -77,7 +77,7 @@ class VideoRecorder:
         frame_hashes: whether to write a `.framehash` file next to a video of images.
         clock: a function that returns the simulated time in seconds, or None if there
             is no simulated time.
-        declared: a function that returns the rate to use without simulated time.
+        declared: a function that returns the rate to use if no time is simulated.
         facts: a function that returns additional metadata. It is called once there is a
             frame.
         strict: whether `close` raises an error if the images show nothing (all black, a

@@ -61,9 +61,9 @@ class Background:
     """Turns ended recordings into trajectories and videos while the caller continues.
 
     `expect`, or the first recording, starts the process that does the work. That
-    process and its workers run until `stop`. If it dies, a second one continues; if
-    that dies too, the remaining work stays pending. A process that hangs during `wait`
-    is killed and counts as dead. Forked processes must not use this object.
+    process and its workers run until `stop`. If the process dies, a second one
+    continues; if that one dies too, the rest stays pending. A process that hangs during
+    `wait` is killed and counts as dead. Forked processes must not use this object.
 
     Args:
         directory: the monitor directory.
@@ -327,7 +327,7 @@ class _Work:
         parent: the simulation's process.
         directory: the monitor directory.
         strict: see `Background`.
-        is_waited_for: whether the parent waits.
+        is_waited_for: whether the parent is waiting.
         last_report: the time of the last report.
     """
 

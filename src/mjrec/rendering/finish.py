@@ -7,8 +7,8 @@ for its monitor), updates manifests and second names, and finishes dead monitors
 (`recover` and `resume=True` do everything except drawing). It can be repeated after an
 interrupt or a kill, and run by any number of processes on one directory.
 
-On an engine, the process that submits the jobs opens no trajectory and draws nothing.
-If it is killed, its workers' finished videos stay. The workers' settings may be
+With an engine, the process that submits the jobs opens no trajectory and draws nothing.
+If it is killed, its workers' finished videos are kept. The workers' settings may be
 `{"models": [sha256, ...]}`: compiled models that the submitting user has stored, which
 the workers may load. The result of a job is a `RenderedVideos`.
 """

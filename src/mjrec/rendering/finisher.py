@@ -42,7 +42,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
 
 class Finisher:
-    """Does the jobs added to it, in order, with one worker pool.
+    """Runs the jobs added to it, in order, with one worker pool.
 
     Args:
         pool: the worker pool; `close` closes it.
@@ -176,7 +176,7 @@ def _plan(job: VideoJob) -> Plan | None:
     """Return the plan for a job; None if there is nothing to do.
 
     Raises:
-        InvalidArgument: the video would replace a recorded one from another camera.
+        InvalidArgument: the video would replace a recorded video from another camera.
         Error: the recording cannot be read.
     """
     if job.variant is None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Render jobs, their settings and their results, as plain data.
 
-A job is for one recording. It is the same wherever it is done: in this process, in the
-background process of a simulation, or in an engine's worker. It can safely be done
-twice, even by two processes at the same time: the second one finds nothing left to do,
-or replaces the file with an identical one.
+A job is for one recording. It is the same wherever it runs: in this process, in the
+background process of a simulation, or in an engine's worker. It can safely run twice,
+even in two processes at the same time: the second one finds nothing left to do, or
+replaces the file with an identical one.
 """
 
 from __future__ import annotations

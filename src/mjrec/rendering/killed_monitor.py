@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that finish the files of a monitor that was killed or did not wait.
+"""Functions that finish the files of a monitor that was killed or closed early.
 
 Recordings in flight become trajectories, live videos get their final names, missing
 lines are added to the journal, and the statistics and the manifest are derived from it.
@@ -207,7 +207,7 @@ class _KilledMonitor:
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
-        """Hold the lock of a file's recording; yield False if another process does."""
+        """Hold the lock of a file's recording; yield False if it is already held."""
         key = key_of(final_name(path.name) or path.name)
         if key is None:
             yield True

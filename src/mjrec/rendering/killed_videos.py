@@ -60,8 +60,8 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
     Args:
         path: the video. Call this for an episode's first camera last, because its
             metadata lists the other cameras' videos.
-        known: known facts about the episode: its `length`, its `reward`, and how it
-            ended, including `complete` if it did.
+        known: known facts about the episode: its `length`, its `reward`, and, if it has
+            ended, the facts about its end, including `complete`.
 
     Yields:
         The file's name and what was done with it. Nothing if only the note was left.
@@ -212,7 +212,7 @@ def finish_text(
     Args:
         part: the hidden file that the frames were written to.
         path: the recording to write.
-        facts: the facts in its episode's trajectory; empty without a trajectory.
+        facts: the facts in the episode's trajectory; empty without a trajectory.
         known: see `finish_video`.
 
     Yields:

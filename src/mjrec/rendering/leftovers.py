@@ -77,7 +77,7 @@ def is_at_work(directory: Path, infix: str) -> bool:
 def stale_shared_files(directory: Path) -> list[Path]:
     """Return the stale files in a directory that do not belong to a single monitor.
 
-    These are unfinished model files, unless a monitor is open, and locks.
+    These are locks and, unless a monitor is open, unfinished model files.
     """
     # List the files before looking at locks, because any process that is working on a
     # listed file already held its lock then.

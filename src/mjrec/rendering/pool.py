@@ -68,7 +68,7 @@ class WorkerPool:
     checks a test frame. Only if that fails does the pool look for the first backend
     that works, like `mjrec.use_gl`.
 
-    Use it from one thread at a time.
+    Use a pool from one thread at a time.
 
     ::
 
@@ -471,7 +471,7 @@ class _Worker:
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
-    """Return the environment variables of workers.
+    """Return the environment variables for workers.
 
     `MUJOCO_GL` is left out if a backend must still be chosen.
 

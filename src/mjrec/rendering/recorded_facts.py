@@ -62,8 +62,8 @@ _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
     """Open a trajectory, which may come from a stranger, and check its facts.
 
-    Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are valid, None,
-    or missing; `stride`, `kept` and `candidate` are valid or missing.
+    Afterwards, `rate`, `timestep`, `scene`, `model`, `video` and `clip` are valid,
+    None, or missing; `stride`, `kept` and `candidate` are valid or missing.
 
     Args:
         path: the trajectory.

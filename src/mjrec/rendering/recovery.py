@@ -68,10 +68,10 @@ def recover(
     """Finish the files that killed monitors or renderers left in a directory.
 
     Live videos get their final names, and metadata with `complete: false` and `reason:
-    "killed"`. Logs become trajectories with the same facts. Statistics and manifest are
-    written from the journal. Unfinished files from dead processes are removed. Deferred
-    videos stay pending: render them with `mjrec render DIR`. Files of open monitors and
-    running renderers are left alone. `docs/howto/recovery.md` has the details.
+    "killed"`. Logs become trajectories with the same facts. The statistics and manifest
+    are written from the journal. Unfinished files from dead processes are removed.
+    Deferred videos stay pending: run `mjrec render DIR`. Files of open monitors and
+    running renderers are left alone. See `docs/howto/recovery.md` for details.
 
     This function can be killed at any time and run again. A second run does nothing.
 
@@ -83,7 +83,7 @@ def recover(
             an evaluation does.
 
     Returns:
-        The finished files and the failures. A failure does not stop the rest.
+        The finished files and the failures. A failure does not affect other files.
 
     Raises:
         InvalidArgument: the directory does not exist, or `timeout` is invalid.

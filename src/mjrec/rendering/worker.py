@@ -179,7 +179,7 @@ def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
 
     Args:
         drawing: `trajectory` (a path) and, optionally, `cameras`; or `states` (a
-            directory written by `save_states`) and `spec`. In both cases also `view`.
+            directory written by `save_states`) and `spec`. Both contain `view`.
         canvas: the canvas to draw with.
 
     Raises:

@@ -139,7 +139,7 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
 
 
 def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
-    """Return whether all episodes were completed, so that numbers have no gaps."""
+    """Return whether all episodes were completed, so that the numbers have no gaps."""
     count, following = len(stats.timestamps), results.details.get("next_episode_id")
     if results.details:
         return following is not None and following - first == count

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor's results, read from its journal or from its statistics file.
 
-A monitor writes each episode twice: to its journal when the episode ends, and to the
-statistics file that its manifest names when the monitor closes (or at each reset). A
-killed monitor leaves only a journal, or a journal and an older manifest. The file with
-more episodes is used; episodes are never taken from both.
+A monitor writes each episode twice: to its journal when the episode ends, and to its
+statistics file when the monitor closes (or at each reset). A killed monitor leaves only
+a journal, or a journal and an older manifest. The file with more episodes is used;
+episodes are never taken from both.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class MonitorResults:
 
     @property
     def env_info(self) -> Mapping[str, Any] | None:
-        """The environment in the manifest, journal or lock; None if unknown."""
+        """The environment's facts in the manifest, journal or lock; None if unknown."""
         with contextlib.suppress(UnreadableFile):
             if self.manifest is not None:
                 return self.manifest.env_info

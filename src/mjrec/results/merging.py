@@ -62,9 +62,9 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     contains pairs of video path and metadata path.
 
     For a monitor that never closed (killed, or still open), the episodes in its journal
-    are used if there are more than in its statistics file. If its manifest is missing,
-    `manifests` lists the journal's path instead, and `videos` lists the videos on disk
-    that are not broken. Damaged lines in a journal are skipped with a warning.
+    are used if there are more of them than in its statistics file. If its manifest is
+    missing, `manifests` lists the journal's path instead, and `videos` lists the videos
+    on disk that are not broken. Damaged lines in a journal are skipped with a warning.
 
     If monitors recorded different environments or versions, a warning is logged, and
     `env_info` comes from the newest monitor. Missing videos are left out with a

@@ -34,7 +34,7 @@ class Run:
             before the extension in the names of additional cameras' videos).
         provenance: the run's provenance; None if unknown.
         count: number of completed episodes.
-        last_episode_id: the highest number of a started episode; -1 if there is none.
+        last_episode_id: the highest number of any episode that began; -1 if none did.
         chosen: the episodes that the schedule chose.
         filmed: the episodes that have, or will have, a video of their own.
         deferred: the filmed episodes whose video is rendered from their states.
