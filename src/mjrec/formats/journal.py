@@ -63,7 +63,7 @@ EVENTS = (
 SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
 _OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
-# Seeds and options are for people to read, so longer ones are truncated.
+# Seeds and options are for people to read, so longer values are truncated.
 _LONGEST_REPR = 1000
 
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
@@ -268,7 +268,7 @@ def read_journal(
         except ValueError as error:
             damaged += 1
             if len(line) >= _LONGEST_LINE or damaged >= _MOST_DAMAGED_LINES:
-                rest = " and all that follows"
+                rest = " and the rest of the file"
             # Its writer was killed in the middle of the line, or is still writing it.
             is_torn = not line.endswith(b"\n") and not rest
             reason = "it was cut off" if is_torn else str(error)
@@ -288,10 +288,10 @@ def read_journal(
         if rest:
             break
     if warns and skipped:
-        lines, first = f"{skipped} lines", "first "
+        lines, first = f"{skipped} lines", "the first is "
         if skipped == 1:
             lines, first = "1 line", ""
-        reason = f"{lines}{rest} left out: {first}{first_reason}"
+        reason = f"skipped {lines}{rest}: {first}{first_reason}"
         logger.warning("%s: %s.", path, reason)
 
 

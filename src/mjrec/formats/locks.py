@@ -99,7 +99,7 @@ class Lock:
         If another program has replaced the file, the new file is kept.
         """
         try:
-            # Removed while still held, so that it is never seen unlocked.
+            # Remove the file before unlocking it, so that it is never seen unlocked.
             if self._descriptor is not None and _is_at(self._descriptor, self._path):
                 self._path.unlink(missing_ok=True)
         finally:

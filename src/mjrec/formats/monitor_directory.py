@@ -415,7 +415,7 @@ def where_recordings_are(directory: Path) -> str:
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
-    return f"Its folders do ({listed(folders, _SHOWN)}): name one of them."
+    return f"Its subfolders do ({listed(folders, _SHOWN)}): choose one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:

@@ -50,7 +50,7 @@ def last_error() -> BaseException | None:
     """
     if hasattr(sys, "ps1"):
         return None
-    # `last_exc` exists since Python 3.12.
+    # `last_exc` was added in Python 3.12.
     error = getattr(sys, "last_exc", None) or getattr(sys, "last_value", None)
     return error if isinstance(error, BaseException) else received()
 

@@ -45,7 +45,7 @@ from ..plain_text import listed
 from ..schedules import capped_cubic_video_schedule, check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
-# The most episode numbers that a message lists.
+# Maximum number of episode numbers listed in a message.
 _SHOWN = 10
 RULES = ("best", "best:N", "worst", "worst:N", "median", "failures", "failures:N")
 RULES_OF_EVALUATIONS = (*RULES, "cubic", "all", "none")

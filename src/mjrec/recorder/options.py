@@ -210,7 +210,7 @@ class RecorderOptions:
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
                 f"The same tracker appears twice in {given!r} and would get every call "
-                "twice. Pass each tracker once."
+                "twice. Pass each tracker only once."
             )
 
     def _check_policy_file(self) -> None:

@@ -215,7 +215,7 @@ class StatsRecorder:
 
     def _check_open(self) -> None:
         if self.closed:
-            raise ClosedError(f"The statistics recorder of {self.path} is closed.")
+            raise ClosedError(f"The statistics recorder for {self.path} is closed.")
 
 
 def reward_to_float(reward: Any) -> float:

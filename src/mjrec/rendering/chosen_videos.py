@@ -72,7 +72,7 @@ def write_choice(
         }
         filmed = {key for key in selections if key.number in live}
         for key, selection in selections.items():
-            # Recorded live, or chosen earlier from fewer episodes.
+            # The episode was recorded live, or chosen earlier from fewer episodes.
             video = folder / key.video_name
             if metadata_path(video).exists():
                 amend_metadata(video, {"selection": selection})

@@ -110,7 +110,7 @@ def finish_killed_monitor(
         try:
             monitor.finish(is_behind=is_behind)
         except BaseException:
-            # Keep the file, because only it may contain the environment's facts.
+            # Keep the file, whose facts about the environment may exist nowhere else.
             lock.let_go()
             raise
         lock.release()

@@ -225,7 +225,7 @@ def finish_text(
         try:
             rate, frames = unfinished_recording(part)
         except UnreadableFile:
-            # It does not contain a complete frame.
+            # The file does not contain a complete frame.
             part.unlink(missing_ok=True)
             yield part.name, "unfinished, removed"
             return

@@ -137,7 +137,7 @@ def write_manifest_and_stats(
     """
     name = f"{stats_prefix(infix)}.stats.json"
     if run is not None and stats is not None:
-        # Write it first, because that reveals a full disk or a missing directory.
+        # Write this file first: it reveals a full disk or a missing directory.
         write_stats_file(directory / name, stats)
     # While a monitor is open, no other process writes these files.
     with contextlib.nullcontext() if run else manifest_lock(directory, infix):
