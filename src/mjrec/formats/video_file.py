@@ -165,7 +165,7 @@ class Encoding:
     def finish(self) -> VideoFile:
         """Complete the file, check it and rename it to its final name.
 
-        Can be called again after Ctrl-C has interrupted it.
+        After Ctrl-C, call this method again to continue.
         """
         self.is_ending = True
         self.thread.close()

@@ -223,7 +223,7 @@ def _is_further(name: str, video: Path) -> bool:
 
 
 def failure_path(video: Path) -> Path:
-    """Return the path of the file that says why a video could not be rendered.
+    """Return the path of the file that states why a video could not be rendered.
 
     The file contains `{"reason": "no OpenGL backend works here: ..."}`. It is written
     when rendering fails, and removed once the video exists.

@@ -501,7 +501,7 @@ class DeferredVideo:
 
     @property
     def broken(self) -> bool:
-        """Whether frame recording ended early; earlier frames are still rendered."""
+        """Whether frame recording ended early. Earlier frames are still rendered."""
         return self._states.broken_reason is not None
 
     @property

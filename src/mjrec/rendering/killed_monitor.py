@@ -249,7 +249,7 @@ class _KilledMonitor:
         return {}
 
     def _known(self, number: int | None) -> dict[str, Any]:
-        """Return the metadata about an episode's end, as far as files have it."""
+        """Return the available metadata about an episode's end."""
         facts = self._facts(number)
         entry = None if number is None else self._entries.get(number)
         known = {key: facts[key] for key in ("length", "reward") if key in facts}
