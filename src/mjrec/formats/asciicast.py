@@ -3,7 +3,7 @@
 
 The format is asciinema's (https://docs.asciinema.org/manual/asciicast/v1/): one JSON
 object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` and
-`stdout`, a list of pairs: a delay in seconds and the text to print after it.
+`stdout`. Each item of `stdout` is a delay in seconds and the text to print after it.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that record which episodes of an evaluation get a video.
 
-The monitors of an evaluation do not plan videos, because the best episode of a task may
-be in any of its chunks. The choice is made when all episodes of a task have ended. It
-is then written into the chosen episodes' trajectories, journals and manifests, as if
-each monitor had made it. These videos are rendered by `finish`, or later by `mjrec
-render`.
+The monitors of an evaluation do not plan videos, because a task's best episode may be
+in any chunk. The choice is made when all episodes of a task have ended. It is then
+written into the chosen episodes' trajectories, journals and manifests, as if each
+monitor had made it. These videos are rendered by `finish`, or later by `mjrec render`.
 
 Episodes that can only be recorded live already have videos. The videos of episodes that
 were not chosen are removed.

@@ -456,7 +456,7 @@ class _Worker:
         return bool(self.owes) and self.error is None and not is_full
 
     def leave(self) -> None:
-        """Forget the job; end the process if it has more to send."""
+        """Forget the job, ending the process if it has more to send."""
         if self.owes and self.error is None:
             self.end()
         self.owes = range(0)

@@ -213,7 +213,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
-    """Return the videos in the manifest, or those on disk if it is outdated."""
+    """Return the manifest's videos, or those on disk if the manifest is outdated."""
     manifest, journal = results.manifest, results.files.journal
     if manifest is not None and not results.is_behind:
         return list(dict.fromkeys(manifest.videos))
