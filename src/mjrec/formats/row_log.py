@@ -2,11 +2,10 @@
 """An append-only log of fixed-size rows that survives SIGKILL without being flushed.
 
 New rows go into the tail, a small file next to the log that is mapped into the writer's
-memory. There, row i is filled in place in slot `i % capacity`, in pages that stay
-cached. A reader needs only one aligned 64-bit counter, which is incremented when a row
-is complete. A full tail is written to the log, where row i begins at byte `i *
-row_size`, before a slot is reused. So at any time, every row is in one of the two
-files.
+memory. Row i is filled in place, in slot `i % capacity`, in pages that stay cached. A
+reader needs only one aligned 64-bit counter, which is incremented when a row is
+complete. A full tail is written to the log, where row i begins at byte `i * row_size`,
+before a slot is reused. So at any time, every row is in one of the two files.
 
 The tail file begins with a page of 64-bit words: the counter, the number of words per
 row, and the number of slots. Closing the log writes its last rows and removes the tail.
