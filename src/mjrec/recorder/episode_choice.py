@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice of which episodes get a video or a trajectory, made as they begin."""
+"""The decision, as each episode begins, whether it gets a video or a trajectory."""
 
 from __future__ import annotations
 

@@ -266,7 +266,7 @@ class Background:
 
 
 class Share:
-    """A `Background` that is shared by several monitors, none of which stops it."""
+    """A `Background` that several monitors share. None of them stops it."""
 
     def __init__(self, background: Background) -> None:
         self.expect, self.submit = background.expect, background.submit
