@@ -81,10 +81,10 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path):
 @pytest.mark.parametrize(
     ("names", "reason"),
     [
-        (["a.mp4\n"], "'a.mp4\\n' is not a video's name"),
+        (["a.mp4\n"], "'a.mp4\\n' is not a video name"),
         (["a.mkv"], "'a.mkv' is no"),
-        (["ð.mp4"], "'ð.mp4' is not a video's name"),
-        (["a.mp4 a.json"], "'a.json' is not a metadata file's name"),
+        (["ð.mp4"], "'ð.mp4' is not a video name"),
+        (["a.mp4 a.json"], "'a.json' is not a metadata file name"),
         (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
         (["Manifest.json"], "the archive's manifest"),
         # In gym's order: pair by pair, and in each presence, doubles, names.

@@ -284,7 +284,7 @@ HEAD = DTYPE.descr[:4]
 ROWS = {
     "the layout of its rows cannot be read": 5,
     "the state of a row": [*HEAD, ["state", "<f8"]],
-    "not all float64": [*HEAD, ["state", [["a", "<f4"], ["", "|V4"]]]],
+    "components that are not float64": [*HEAD, ["state", [["a", "<f4"], ["", "|V4"]]]],
     "is not a valid array name": [*HEAD, ["snapshot", [["a/b", "<f8"]]]],
     "not a valid dtype for a trajectory": [*HEAD, ["action", "|O"]],
     "cannot be read": [*HEAD, ["action", "<f8", [1 << 62]]],

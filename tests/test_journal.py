@@ -85,7 +85,7 @@ def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
         caplog.clear()
         assert read(path) == [ENTRY]
         [said] = caplog.messages
-        assert f"{path}: 1 line left out: line 2" in said
+        assert f"{path}: skipped 1 line: line 2" in said
         assert "cut off" in said
     assert "line 2 (episode 4)" in said
     numbers = []
@@ -114,7 +114,7 @@ def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
     # Of two lines with one number the first is read, in any order of numbers.
     assert read(path) == [late, NEXT, ENTRY]
     [said] = caplog.messages
-    assert f"{path}: 3 lines left out: first line 2" in said
+    assert f"{path}: skipped 3 lines: the first is line 2" in said
     assert reason in said
 
 
@@ -126,12 +126,12 @@ def test_what_is_no_journal_is_given_up_on(path, caplog):
     assert read(path) == [ENTRY]
     path.write_bytes(b"\n" * 1000 + line)
     assert read(path) == []
-    assert "1000 lines and all that follows left out" in caplog.text
+    assert "skipped 1000 lines and the rest of the file" in caplog.text
     path.write_bytes(line)
     with path.open("r+b") as file:
         file.truncate(1 << 40)
     assert read(path) == [ENTRY]
-    assert "1 line and all that follows left out: line 2" in caplog.text
+    assert "skipped 1 line and the rest of the file: line 2" in caplog.text
     assert "too long" in caplog.text
 
 

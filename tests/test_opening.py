@@ -83,7 +83,7 @@ def test_a_torn_line_keeps_its_number(tmp_path, caplog):
     journal = write_journal(tmp_path, "0.7", 0, 1, run={"env_info": ENV_INFO})
     journal.write_bytes(journal.read_bytes()[:-20])
     assert first_number(tmp_path) == 2
-    assert "line left out: line 3 (episode 1)" in caplog.text
+    assert "skipped 1 line: line 3 (episode 1)" in caplog.text
 
 
 @pytest.mark.parametrize("number", [True, -1, 1.5, "7", 10**4000, {}])

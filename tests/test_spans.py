@@ -313,7 +313,7 @@ def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
         content = read(episode(path.parent, 28))
         assert (len(content.states), content.dropped) == (0, 6)
         log.write_bytes(bytes(100 * ROW))
-        with pytest.raises(UnreadableFile, match="changed while it was read"):
+        with pytest.raises(UnreadableFile, match="changed while being read"):
             reader.snapshots(0, 4)
 
 

@@ -294,7 +294,7 @@ def test_a_full_disk_is_one_error(tmp_path, monkeypatch, of_what):
 @pytest.mark.usefixtures("no_process_is_left")
 def test_a_file_with_other_frames_is_not_kept(tmp_path, arguments, left):
     """A frame lost or doubled by the encoder is found in the finished file."""
-    message = f"should contain 100 frames, but decoding gives {left}"
+    message = f"should contain 100 frames, but decoding it gives {left}"
     with pytest.raises(FrameCountError, match=message):
         record(
             tmp_path / "a.mp4", map(numbered, range(100)), encoder_arguments=arguments

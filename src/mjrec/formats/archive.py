@@ -7,7 +7,7 @@ The archive is a gzipped tar file without directories::
     manifest.json                {"version": 0, "videos": [[video, metadata], ...]}
 
 The archive depends only on the names and contents of the files, not on their times,
-owners and permissions: the same videos give the same bytes.
+owners or permissions. The same videos always produce the same bytes.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def write_archive(
     archive_file: IO[bytes],
     env_id: str | None = None,
 ) -> None:
-    """Write gym's archive of videos with their metadata.
+    """Write videos and their metadata to an archive in gym's format.
 
-    Everything is checked and read before the first byte is written.
+    All files are checked and read before the first byte is written.
 
     Args:
         videos: pairs of video path and metadata path, as in
-            `load_results(...)["videos"]`; at most 100, with different names.
+            `load_results(...)["videos"]`; at most 100, all with different names.
         archive_file: a binary file open for writing. It is not closed.
         env_id: the environment's id, for error messages.
 
@@ -81,14 +81,14 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
     for video, metadata in pairs:
         if not os.path.lexists(video):
             yield (
-                f"The video {video} does not exist. Its recording may have failed: see "
-                "the recorder's `functional`."
+                f"The video {video} does not exist. Its recording may have failed: "
+                "check the recorder's `functional`."
             )
         if not os.path.lexists(metadata):
             yield f"{metadata}, the metadata of the video {video}, does not exist."
         for path in (video, metadata):
             if not stat.S_ISREG(path.lstat().st_mode):
-                yield f"{path} is a link, a directory or a device. Give a regular file."
+                yield f"{path} is a link, a directory or a device. Use a regular file."
         for path in (video, metadata):
             if path.name in taken:
                 yield (
@@ -98,14 +98,14 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
             taken.add(path.name)
         plain = "it must consist of letters, digits, '_', '-' and '.', and end in"
         if not _VIDEO_NAME.fullmatch(video.name):
-            yield f"{video.name!r} is not a video's name: {plain} .mp4, .avi or .json."
+            yield f"{video.name!r} is not a video name: {plain} .mp4, .avi or .json."
         if video.name.endswith(".meta.json"):
             yield f"{video.name!r} is a metadata file's name, not a video's."
         if video.name.lower() == _MANIFEST:
             yield f"{video.name!r} is the name of the archive's manifest. Rename it."
         if not _METADATA_NAME.fullmatch(metadata.name):
             yield (
-                f"{metadata.name!r} is not a metadata file's name: {plain} .meta.json."
+                f"{metadata.name!r} is not a metadata file name: {plain} .meta.json."
             )
 
 

@@ -3,7 +3,7 @@
 
 The format is asciinema's (https://docs.asciinema.org/manual/asciicast/v1/): one JSON
 object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` and
-`stdout`, a list of pairs: a delay in seconds and the text printed after it.
+`stdout`. Each item of `stdout` is a delay in seconds and the text to print after it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .json_fields import unreadable
 # The frames come first, one per line. The fields that depend on all frames follow.
 _BEGIN = '{"stdout": [\n'
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
-# Control sequences (colours, cursor) take no space on the screen; see ECMA-48, 5.4.
+# Control sequences (colors, cursor) take up no space on the screen; see ECMA-48, 5.4.
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 
 
@@ -46,9 +46,9 @@ def text_of_frame(frame: object) -> str:
 
 
 class AsciicastWriter:
-    """A writer that puts text frames into a file; each is shown for the same time.
+    """A writer for text frames, which are all shown for the same duration.
 
-    Each frame is written at once to a hidden file, which `close` renames to the
+    Each frame is immediately written to a hidden file, which `close` renames to the
     recording's name.
 
     Args:

@@ -4,15 +4,15 @@
 A finished trajectory is stored either in a file of its own or in a bundle,
 `openaigym.trajectories.<infix>.h5`. A bundle's group `episode000027` has the same
 content as the root of the file `openaigym.trajectory.<infix>.episode000027.h5`. A
-trajectory is always identified by the path of its own file, even if it is in a bundle;
-`is_finished` and `file_of` locate it.
+trajectory is always identified by the path of its own file, even if it is in a bundle.
+Use `is_finished` and `file_of` to locate it.
 
 A bundle begins with a list of its episodes, as ranges of episode numbers. The list is
-in what HDF5 calls the user block::
+stored in the HDF5 user block::
 
     {"format": "mjrec trajectories", "version": 1, "episodes": [[0, 23], [25, 25]]}
 
-So listing a directory does not need the HDF5 library.
+Therefore, listing a directory does not require the HDF5 library.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def is_finished(path: Path) -> bool:
 
 
 def file_of(path: Path) -> Path:
-    """Return the file that holds a trajectory, or `path` if no file does."""
+    """Return the file that holds a trajectory, or `path` if there is none."""
     if not path.is_file() and path.suffix == FINISHED:
         bundle = bundle_of(path)
         if episode_of(path.name) in _episodes_in(bundle):

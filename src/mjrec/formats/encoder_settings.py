@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ffmpeg's encoding settings: codec, quality, colours and container.
+"""ffmpeg's encoding settings: codec, quality, colors and container.
 
-The same frames give the same file on any CPU and with any number of cores: the number
-of threads is fixed, x264 uses only algorithms that give the same result on every CPU
-(`cpu-independent=1`), and colours are converted with exact rounding.
+The same frames produce the same file on any CPU with any number of cores: the number of
+threads is fixed, x264 uses only algorithms that give the same result on every CPU
+(`cpu-independent=1`), and colors are converted with exact rounding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WORST_CRF = 51.0
 # depend on the machine.
 _ENCODER_THREADS = 4
 
-# Containers, by file name suffix.
+# Container formats, keyed by file suffix.
 MUXERS = {
     ".mp4": "mp4",
     ".mov": "mov",
@@ -40,7 +40,7 @@ MUXERS = {
 _STANDARD_OUTPUT = "pipe:1"
 _TRIAL_SIDE = 64
 
-# Pixel formats that hold rgb24 without loss.
+# Pixel formats that store rgb24 losslessly.
 _RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
 _LOSSLESS_CODECS = frozenset(
     {"ffv1", "libx264rgb", "utvideo", "png", "apng", "qtrle", "ffvhuff", "huffyuv"}
@@ -76,8 +76,8 @@ class EncoderSettings:
 
     Attributes:
         codec: ffmpeg's name for the encoder.
-        pixel_format: pixel format of the encoded video: yuv420p, or one that holds
-            rgb24 without loss.
+        pixel_format: pixel format of the encoded video: yuv420p, or a format that
+            stores rgb24 losslessly.
         muxer: ffmpeg's name for the container.
         encoding: the arguments between the input and the container.
     """
@@ -93,14 +93,14 @@ class EncoderSettings:
         """Return ffmpeg's arguments for encoding rgb24 frames from standard input."""
         index = "+faststart"
         if output == _STANDARD_OUTPUT:
-            # The beginning of a pipe cannot be rewritten.
+            # The beginning of a file cannot be rewritten through a pipe.
             index = "+frag_keyframe+empty_moov"
         return [
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
             *("-f", "rawvideo", "-pixel_format", "rgb24"),
             *("-video_size", f"{width}x{height}"),
-            # Not `-framerate`: ffmpeg would write a nearby common rate to the file. It
-            # does this for some rates always, and for 125 if there are 3 to 9 frames.
+            # With `-framerate`, ffmpeg would write a nearby common rate to the file:
+            # for some rates always, and for 125 if there are 3 to 9 frames.
             *("-r", f"{fps.numerator}/{fps.denominator}"),
             *("-i", "pipe:0"),
             *self.encoding,
@@ -156,7 +156,7 @@ def encoder_settings(
 def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
     """Try an encoding, so that invalid settings fail before any work is done.
 
-    Each encoding is tried once for each ffmpeg binary.
+    Each encoding is tried only once per ffmpeg binary.
 
     Raises:
         EncoderError: ffmpeg cannot encode with these settings.
@@ -166,7 +166,7 @@ def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
 
 
 def try_encoding(settings: EncoderSettings, fps: Fraction) -> str:
-    """Encode one small grey frame, and return a note that it works.
+    """Encode one small gray frame, and return a note that this worked.
 
     Raises:
         EncoderError: ffmpeg cannot encode with these settings.
@@ -239,13 +239,13 @@ def _encoder_help(codec: str) -> str:
         " ".join(arguments),
         lambda: run_ffmpeg(arguments).decode("utf-8", errors="replace"),
     )
-    # If given the name of a codec, ffmpeg shows all encoders for that codec.
+    # Given the name of a codec, ffmpeg describes all encoders for that codec.
     if f"Encoder {codec} [" not in text:
         raise UnknownName(
             "video encoder",
             codec,
             video_encoders(),
-            hint=f"These are the encoders of {ffmpeg_executable()}, "
+            hint=f"These are the encoders in {ffmpeg_executable()}, "
             f"{ffmpeg_version()}.",
         )
     return text

@@ -39,20 +39,20 @@ _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
 _PIPE_SIZE = 1 << 20
 _SECONDS_TO_DIE = 10.0
-# The libavutil of ffmpeg 5.1, which renamed an option; ffmpeg 9 removed the old name.
+# libavutil in ffmpeg 5.1, which renamed an option. ffmpeg 9 removed the old name.
 _LIBAVUTIL_OF_FPS_MODE = (57, 28)
 _MOST_BYTES = 1 << 20
 _MOST_PROGRAMS = 8
 
-# The answers for each program, by question.
+# The answers for each program, keyed by question.
 _answers: dict[str, dict[str, str]] = {}
 
 
 def ffmpeg_executable() -> str:
     """Return the path of ffmpeg.
 
-    This is the ffmpeg that `IMAGEIO_FFMPEG_EXE` names, otherwise the one that comes
-    with `imageio-ffmpeg`, otherwise conda's or the system's.
+    This is the binary that `IMAGEIO_FFMPEG_EXE` names, if it is set; otherwise the one
+    bundled with `imageio-ffmpeg`, conda's or the system's.
 
     Raises:
         MissingDependency: no ffmpeg was found.
@@ -84,12 +84,12 @@ def ffmpeg_sha256() -> str:
 
 
 def remembered(question: str, answer: Callable[[], str]) -> str:
-    """Return the answer to a question about ffmpeg, which is asked only once.
+    """Return the answer to a question about ffmpeg, asking only once.
 
     Asking ffmpeg three questions and hashing its 80 megabytes takes as long as
-    rendering a hundred small frames. So the answers are cached in
+    rendering a hundred small frames, so the answers are cached in
     `$XDG_CACHE_HOME/mjrec/programs.json` (`~/.cache/mjrec/programs.json` by default),
-    which can be deleted at any time. They are valid only for exactly the same file: the
+    which can be deleted at any time. They are valid only for the same file, with the
     same path, device, inode, size, mtime and ctime (which only the kernel can set).
 
     Args:
@@ -118,7 +118,7 @@ def remembered(question: str, answer: Callable[[], str]) -> str:
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
-    # An unreadable cache does no harm, because the programs can be asked again.
+    # An unreadable cache is harmless, because its answers can be obtained again.
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
         stored = json.loads(read_regular(path, limit=_MOST_BYTES))
         return {key: dict(value) for key, value in stored.items()}
@@ -135,8 +135,8 @@ def video_encoders() -> list[str]:
 def every_frame_arguments() -> tuple[str, ...]:
     """Return the output arguments that make ffmpeg keep each frame exactly once.
 
-    By default, ffmpeg fills gaps with copies and drops early frames to make the rate
-    even. When decoding, that hides missing and duplicate frames.
+    By default, ffmpeg duplicates and drops frames to keep the rate constant. During
+    decoding, this would hide missing and duplicate frames.
     """
     version = re.search(r"^libavutil +(\d+)\. *(\d+)", _version(), re.M)
     is_old = version and tuple(map(int, version.groups())) < _LIBAVUTIL_OF_FPS_MODE
@@ -184,8 +184,8 @@ class FfmpegProcess:
     input and finishes its file on its own. Leaving the `with` block kills the process.
 
     Each method that waits for ffmpeg kills it if it hangs for `timeout_s`. It hangs if
-    it accepts no input, returns no output, or has all of its input but does not change
-    its file.
+    it accepts no input, returns no output, or has received all input but does not
+    change its file.
 
     Args:
         arguments: the arguments after the program's name.
@@ -215,7 +215,7 @@ class FfmpegProcess:
         self._timeout = Timeout()
         try:
             with contextlib.ExitStack() as on_failure:
-                # A file, because a pipe would have to be emptied while ffmpeg runs.
+                # Use a file, because a pipe would have to be drained while ffmpeg runs.
                 stderr = on_failure.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(
                     self.command,
@@ -250,7 +250,7 @@ class FfmpegProcess:
         return self._process.pid
 
     def write(self, data: bytes | Frame) -> None:
-        """Feed `data` to ffmpeg, waiting until the pipe has taken all of it.
+        """Feed `data` to ffmpeg, waiting until the pipe has accepted all of it.
 
         Raises:
             EncoderError: ffmpeg has ended, or hangs.
@@ -267,8 +267,8 @@ class FfmpegProcess:
                 else:
                     self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
-            # ValueError means that the pipe was closed before. ffmpeg ends on its own
-            # after closing its input, but a wrapper script may not.
+            # ValueError means that the pipe was already closed. ffmpeg itself ends once
+            # its input is closed, but a wrapper script may not.
             self._has_ended(_SECONDS_TO_DIE)
             self.kill()
             raise self._error() from error
@@ -300,7 +300,7 @@ class FfmpegProcess:
             raise self._error()
 
     def kill(self) -> None:
-        """Kill the process at once, and any processes that a wrapper script started.
+        """Kill the process, along with any processes that a wrapper script started.
 
         The pipes stay open: a thread may be about to write, and a closed descriptor's
         number may already belong to another file.
@@ -309,11 +309,11 @@ class FfmpegProcess:
             # The process leads its own process group, and may already have ended.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-        # A process that waits for a broken disk cannot die, so do not wait forever.
+        # A process that is blocked on a broken disk cannot die, so do not wait forever.
         self._has_ended(_SECONDS_TO_DIE)
 
     def release(self) -> None:
-        """Close the pipes of a process that has ended. No thread may still use them."""
+        """Close the pipes of an ended process. No thread may still be using them."""
         self.close_inherited_pipes()
         self._stderr.close()
         _running.discard(self)
@@ -321,8 +321,8 @@ class FfmpegProcess:
     def close_inherited_pipes(self) -> None:
         """Close a forked child's copies of the pipes.
 
-        While any process holds the writing end, ffmpeg does not see the end of its
-        input, and the parent's `wait` would last as long as the child lives.
+        While any process holds the write end, ffmpeg does not see the end of its input.
+        The parent's `wait` would then last until the child ends.
         """
         for pipe in self._pipes:
             pipe.close()
@@ -345,7 +345,7 @@ class FfmpegProcess:
         is_ready: Callable[[float], bool],
         state: Callable[[], object] = lambda: None,
     ) -> None:
-        """Wait, and kill the process if there is no progress for too long.
+        """Wait, killing the process if it makes no progress for too long.
 
         Args:
             is_ready: a function that waits for at most the given number of seconds, and
@@ -368,7 +368,7 @@ class FfmpegProcess:
         return self._process.returncode is not None
 
     def _state_of_output(self) -> tuple[int, int]:
-        """Return a value that changes while ffmpeg writes its file, if there is one."""
+        """Return a value that changes while ffmpeg writes its file, if any."""
         protocol, _, path = self.command[-1].partition(":")
         if protocol == "file":
             with contextlib.suppress(OSError):
@@ -423,12 +423,12 @@ def _unusable(reason: str, executable: str | None = None) -> Error:
     if named:
         return InvalidArgument(
             f"{_ENVIRONMENT_VARIABLE} is {named!r}, which cannot be started: {reason}. "
-            "Unset it, or set it to the path of an ffmpeg."
+            "Unset it, or set it to the path of an ffmpeg binary."
         )
     return MissingDependency(
         "ffmpeg",
         purpose="Writing a video",
         reason=executable and f"{executable} cannot be started: {reason}",
         install="pip install --force-reinstall imageio-ffmpeg, or set "
-        f"{_ENVIRONMENT_VARIABLE} to the path of an ffmpeg",
+        f"{_ENVIRONMENT_VARIABLE} to the path of an ffmpeg binary",
     )

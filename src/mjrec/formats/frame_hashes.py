@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `.framehash` file: the SHA-256 of each rendered frame.
 
-The content is byte for byte the same as the output of ffmpeg's `framehash` muxer for
+The content is byte for byte identical to the output of ffmpeg's `framehash` muxer for
 the same frames as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f
-framehash`). Tools that read ffmpeg's files can read it too::
+framehash`). Tools that read ffmpeg's files can read this file too::
 
     #format: frame checksums
     #version: 2
@@ -16,9 +16,9 @@ framehash`). Tools that read ffmpeg's files can read it too::
     #stream#, dts,        pts, duration,     size, hash
     0,          0,          0,        1,   691200, 5b1f...
 
-The time base (`tb`) is the duration of a frame in seconds; dimensions are WIDTHxHEIGHT;
-`size` is in bytes. A frame's bytes are its rows from top to bottom, and each pixel is
-its red, green and blue.
+The time base (`tb`) is the duration of a frame in seconds, dimensions are WIDTHxHEIGHT,
+and `size` is in bytes. A frame's bytes are its rows from top to bottom, with red, green
+and blue for each pixel.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ..frames import Frame
 
 
 def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
-    """Return the lines before the first frame."""
+    """Return the lines before the line for the first frame."""
     return (
         "#format: frame checksums\n"
         "#version: 2\n"
@@ -55,7 +55,7 @@ def frame_hash_line(number: int, frame: Frame) -> str:
 
 
 def cut_frame_hashes(path: Path, count: int) -> None:
-    """Atomically cut a file down to the hashes of its first `count` frames.
+    """Atomically truncate a file to the hashes of its first `count` frames.
 
     Raises:
         OSError: the file cannot be read or written.
@@ -66,7 +66,7 @@ def cut_frame_hashes(path: Path, count: int) -> None:
     # The last line may be incomplete.
     kept = [line for line in lines[: header + count] if line.endswith("\n")]
     if len(kept) < header + count:
-        raise ValueError(f"it has hashes of fewer than {count} frames")
+        raise ValueError(f"it has hashes for fewer than {count} frames")
     if len(kept) < len(lines):
         with replacing(path) as temporary:
             temporary.write_text("".join(kept), encoding="ascii")

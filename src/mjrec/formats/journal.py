@@ -3,8 +3,8 @@
 
 `openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that no completed
 episode is lost if the process is killed. The statistics and the manifest are derived
-from it. It also records which rows of the logs belong to which recording (see `spans`).
-Each completed episode is a line::
+from it. It also records which rows in the logs belong to which recording (see `spans`).
+Each completed episode has one line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
@@ -49,7 +49,7 @@ _BLOCK = 4096
 MOST_EPISODES = 10**15
 
 # In order: the run's facts; its machine, packages and code; an episode that is not part
-# of the statistics; a finished clip; an action that does not fit into rows; an episode
+# of the statistics; a finished clip; an action that does not fit into a row; an episode
 # whose video is dropped while its trajectory stays; a failure to record something; the
 # videos that were kept; the end of the run; the recovery of the directory by another
 # process; the beginning of an episode of an evaluation; the failure of such an episode.
@@ -63,7 +63,7 @@ EVENTS = (
 SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
 _OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
-# Seeds and options are for people to read, so longer ones are truncated.
+# Seeds and options are for people to read, so longer values are truncated.
 _LONGEST_REPR = 1000
 
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
@@ -74,12 +74,12 @@ class JournalEntry:
     """One completed episode.
 
     Attributes:
-        episode_id: the episode's number; all episodes that began are counted, from 0.
+        episode_id: the episode's number, counting every episode that began, from 0.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
-        start_time: wall clock time just before the reset.
-        end_time: wall clock time after the last step.
+        start_time: wall-clock time just before the reset.
+        end_time: wall-clock time after the last step.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
         terminated: whether the task ended the episode.
@@ -111,9 +111,9 @@ class JournalEntry:
 class JournalWriter:
     """A writer that appends episodes and other events to a journal.
 
-    The first event creates the file. Each event is one `write` of whole lines, so that
-    readers see only whole lines at any moment, even after the process is killed. Lines
-    that could not be written because the disk was full are written before the next one.
+    The first event creates the file. Each event is a single `write` of whole lines, so
+    readers see only whole lines at any time, even after the process is killed. Lines
+    that did not fit on a full disk are written before the next line.
 
     Args:
         path: the file.
@@ -121,8 +121,8 @@ class JournalWriter:
 
     Attributes:
         path: the file.
-        lost: number of times that the file was removed. A new file does not repeat the
-            lines of the removed file.
+        lost: number of times the file was removed. A new file does not repeat the lines
+            of the removed file.
     """
 
     def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
@@ -136,7 +136,7 @@ class JournalWriter:
     def append(self, entry: JournalEntry) -> None:
         """Record a completed episode.
 
-        If its seed or options would make a line of 16 MiB or more, they are written as
+        If the seed or options would make the line 16 MiB or longer, they are written as
         `{"repr": ...}` and truncated.
 
         Raises:
@@ -144,7 +144,7 @@ class JournalWriter:
             FileNotWritten: the journal was removed, or cannot be written now and is
                 unchanged (for example, because the disk is full).
         """
-        # Not `asdict`, which would deep-copy the options; they may not support that.
+        # `asdict` would deep-copy the options, which may not support that.
         optional_keys = ("chosen", "recording", "evaluation")
         left_out = [key for key in optional_keys if not vars(entry)[key]]
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
@@ -173,7 +173,7 @@ class JournalWriter:
 
     @property
     def is_behind(self) -> bool:
-        """Whether some lines could not be written yet."""
+        """Whether some lines have not been written yet."""
         return bool(self._unwritten)
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ class JournalWriter:
         if self._run is not None and self._is_empty:
             lines = f"{dumps({'run': self._run})}\n".encode() + lines
         try:
-            # Only an earlier writer, or a failure, can have left half a line.
+            # Only an earlier writer or a failure can have left an incomplete line.
             is_whole, self._is_whole = self._is_whole, False
             append_whole(self._descriptor, lines, torn=b"" if is_whole else b"\n")
             self._is_empty, self._is_whole = False, True
@@ -223,7 +223,7 @@ def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_spans(line: bytes) -> bool:
-    """Return whether a journal's line is about rows; `formats.spans` reads these."""
+    """Return whether a journal line is about rows, which `formats.spans` handles."""
     return line.startswith(_OF_SPANS)
 
 
@@ -236,7 +236,7 @@ def read_journal(
 ) -> Iterator[JournalEntry]:
     """Yield a journal's entries in the order in which they were written.
 
-    Invalid lines are skipped, and so are episodes whose number has occurred before.
+    Invalid lines are skipped, and so are episodes whose number has already occurred.
     After a line of 16 MiB or more, or after too many damaged lines, the rest of the
     file is skipped.
 
@@ -268,7 +268,7 @@ def read_journal(
         except ValueError as error:
             damaged += 1
             if len(line) >= _LONGEST_LINE or damaged >= _MOST_DAMAGED_LINES:
-                rest = " and all that follows"
+                rest = " and the rest of the file"
             # Its writer was killed in the middle of the line, or is still writing it.
             is_torn = not line.endswith(b"\n") and not rest
             reason = "it was cut off" if is_torn else str(error)
@@ -288,10 +288,10 @@ def read_journal(
         if rest:
             break
     if warns and skipped:
-        lines, first = f"{skipped} lines", "first "
+        lines, first = f"{skipped} lines", "the first is "
         if skipped == 1:
             lines, first = "1 line", ""
-        reason = f"{lines}{rest} left out: {first}{first_reason}"
+        reason = f"skipped {lines}{rest}: {first}{first_reason}"
         logger.warning("%s: %s.", path, reason)
 
 
@@ -310,9 +310,9 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
 
 
 def count(value: Any) -> int:
-    """Return a value from a journal as a number of episodes, steps or rows."""
+    """Convert a value from a journal to a number of episodes, steps or rows."""
     number = integer(value)
     if not 0 <= number < MOST_EPISODES:
-        # Do not show its digits: there may be thousands.
+        # Do not show the value, because it may have thousands of digits.
         raise ValueError("it is negative or too large for a count")
     return number

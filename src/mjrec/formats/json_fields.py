@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checked access to values in untrusted JSON, and dataclasses as JSON objects.
 
-Every function here raises `ValueError` with a reason that can follow "Cannot read
-FILE:"; the readers of the file formats turn it into `UnreadableFile`.
+The functions here raise `ValueError` with a reason that fits after "Cannot read FILE:".
+The readers of the file formats turn this error into `UnreadableFile`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _KINDS = {
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn errors about a file's content, inside the block, into `UnreadableFile`."""
+    """Turn errors about a file's content in the block into `UnreadableFile`."""
     try:
         yield
     except OSError as error:
@@ -87,7 +87,7 @@ def json_object(data: bytes) -> Mapping[str, Any]:
 def field(
     values: Mapping[str, Any], key: str, convert: Callable[[Any], T], **default: T
 ) -> T:
-    """Return `values[key]`, converted, or `default` if the key is missing."""
+    """Return the converted `values[key]`, or `default` if the key is missing."""
     if key not in values:
         if default:
             return default["default"]
@@ -215,7 +215,7 @@ _PLAIN: dict[object, _Read] = {
 
 
 def to_json(instance: Any) -> dict[str, Any]:
-    """Convert a dataclass to a JSON object. NaN is kept; `json_text` makes it null."""
+    """Convert a dataclass to a JSON object. `json_text` writes NaN as null."""
     names = [each.name for each in dataclasses.fields(instance)]
     return {name: _plain(getattr(instance, name)) for name in names}
 
@@ -252,7 +252,7 @@ def from_json(kind: type[D], value: Any) -> D:
 # Cached because a journal may have millions of entries.
 @functools.cache
 def _readers(kind: Any) -> list[tuple[str, _Read, bool]]:
-    """Return name and reader of each field, and whether it has no default."""
+    """Return each field's name and reader, and whether the field is required."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return [
         (

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ends of episodes whose process was killed before it could record them.
+"""How episodes ended if their process was killed before recording the end.
 
 An episode's last row shows whether the episode is complete. If so, only its end is
 missing from the journal, and it counts like any other episode. Otherwise, it has
-`complete: false` and `reason: "killed"`, keeps all rows up to the kill, and is not in
-the statistics.
+`complete: false` and `reason: "killed"`, keeps all rows up to the kill, and does not
+count in the statistics.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CUT_BY_KILL = {"complete": False, "reason": KILLED}
 def how_it_ended(
     reader: TrajectoryReader, recording: Recording | None
 ) -> dict[str, Any]:
-    """Derive facts about an episode's end from its rows, if its facts lack them.
+    """Derive any missing facts about an episode's end from its rows.
 
     Args:
         reader: the reader of the episode's rows.
@@ -33,7 +33,7 @@ def how_it_ended(
     """
     facts = reader.facts
     if "complete" in facts:
-        # If the last rows found no room on the disk, the reward is left to be added up.
+        # If the disk had no room for the last rows, the rewards were not added up.
         is_cut = facts.get("reward", 0) is None
         return {"reward": added_up(reader.rewards)} if is_cut else {}
     known: dict[str, Any] = {
@@ -61,7 +61,7 @@ def how_it_ended(
 def missing_line(
     facts: Mapping[str, Any], choice: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
-    """Return the kind and the facts of the journal line that a kill prevented.
+    """Return the kind and facts of the journal line that a killed process left out.
 
     Args:
         facts: the facts in the episode's trajectory; empty if there is no trajectory.

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lock files. The kernel, not a process id, shows whether the holder is alive.
 
-An open monitor keeps `.openaigym.<infix>.lock` locked (with `flock`). The kernel drops
-the lock however the process ends, so a lock file that no process holds was left by a
-dead monitor. A process id would not show this, because process ids are reused, and very
-often in containers.
+An open monitor keeps `.openaigym.<infix>.lock` locked (with `flock`). The kernel
+releases the lock no matter how the process ends, so a lock file that no process holds
+was left by a dead monitor. A process id would not show this, because process ids are
+reused, especially in containers.
 
 A monitor's lock is never reused, because its name belongs to that monitor alone. The
 other locks (for rendering a video, using a CPU or rewriting a manifest) are reused, and
-a lock file that a dead process left is taken over.
+a lock file left by a dead process is taken over.
 
-A directory may be untrusted. If a link, a pipe or a file with a second hard link is in
-the place of a lock, it is never followed, written to or waited for. Acquiring such a
-lock raises an error that says so.
+A directory may be untrusted. A link, a pipe or a file with a second hard link in place
+of a lock file is never followed, written to or waited for. Acquiring such a lock raises
+an error.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Self
 
 from ..errors import DirectoryNotWritable
 
-# `is_locked` holds the lock for a moment, which is not a reason to give up.
+# `is_locked` briefly holds the lock, which is not a reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002
 
@@ -47,18 +47,18 @@ class Lock:
 
     Args:
         path: the file to create; it must not exist.
-        content: information about the lock's holder for others to read; it stays when
-            the holder dies.
+        content: information about the lock's holder for other processes. It remains
+            when the holder dies.
         mode: the file's permission bits.
 
     Raises:
-        FileExistsError: the file exists, whether it is held or was left behind.
+        FileExistsError: the file exists, whether or not a process holds it.
         OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path, content: str, *, mode: int = 0o644) -> None:
-        # Python opens every descriptor close-on-exec: an encoder that outlives this
-        # process does not keep the lock.
+        # Python opens every descriptor with close-on-exec, so an encoder that outlives
+        # this process does not keep the lock.
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
         descriptor = os.open(path, flags, mode)
         self._take(path, descriptor)
@@ -96,10 +96,10 @@ class Lock:
     def release(self) -> None:
         """Remove the file and release the lock. Idempotent.
 
-        A file that another program has put in its place is kept.
+        If another program has replaced the file, the new file is kept.
         """
         try:
-            # Removed while still held, so that it is never seen unlocked.
+            # Remove the file before unlocking it, so that it is never seen unlocked.
             if self._descriptor is not None and _is_at(self._descriptor, self._path):
                 self._path.unlink(missing_ok=True)
         finally:
@@ -115,8 +115,8 @@ class Lock:
 def try_lock(path: Path) -> Lock | None:
     """Return a lock at `path`, or None if another process holds it.
 
-    A file that no process holds is taken over with its content. A missing file is
-    created.
+    A file that no process holds is taken over, and its content is kept. A missing file
+    is created.
 
     Raises:
         DirectoryNotWritable: the file cannot be created or opened, or is a link or not
@@ -130,7 +130,7 @@ def try_lock(path: Path) -> Lock | None:
 
 
 def wait_for_lock(path: Path) -> Lock:
-    """Wait until no other process holds the lock at `path`, and return it.
+    """Acquire the lock at `path`, waiting until no other process holds it.
 
     Raises:
         DirectoryNotWritable: see `try_lock`.
@@ -159,7 +159,7 @@ def _taken(path: Path, operation: int) -> Lock:
 
 
 def _opened(path: Path) -> int:
-    """Return a descriptor of the lock file at `path`, creating it if missing."""
+    """Return a descriptor for the lock file at `path`, creating it if missing."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR | _CAREFULLY, 0o644)
     except OSError as error:

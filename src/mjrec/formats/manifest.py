@@ -2,14 +2,14 @@
 """Gym's two files for each monitor: the manifest and the statistics.
 
 The manifest, `openaigym.manifest.<infix>.manifest.json`, lists the files that belong to
-one monitor. It is written last, so that every file it lists is complete. Names in it
-are base names: the directory can be moved, and an untrusted manifest cannot point
+one monitor. It is written last, so that every file it lists is complete. It contains
+only base names, so the directory can be moved, and an untrusted manifest cannot point
 outside its own directory.
 
 The statistics, `openaigym.episode_batch.<infix>.stats.json`, have the keys of
 `StatsFile`, in this order. The lists have one item for each completed episode. Gym
 itself wrote one type for each *reset*, so its `episode_types` can be longer than the
-other lists. It is read unchanged.
+other lists. Such a list is read unchanged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .json_fields import (
 )
 from .regular_files import read_regular
 
-# The version that this package writes in place of gym's version.
+# The version that is written in place of gym's version.
 GYM_VERSION = "mjrec-1"
 
 
@@ -92,7 +92,7 @@ def _pair(value: Any) -> tuple[str, str]:
 
 
 def _details(value: Any) -> Mapping[str, Any]:
-    """Return the facts that gym did not write, after checking those that are used."""
+    """Return the facts that gym did not write, after checking those that mjrec uses."""
     details = mapping(value)
     next_id = field(details, "next_episode_id", optional(integer), default=None)
     if next_id is not None and next_id < 0:
@@ -128,13 +128,13 @@ class StatsFile:
 
 
 def read_stats_file(path: Path) -> StatsFile:
-    """Read a statistics file. A reward that is null becomes NaN.
+    """Read a statistics file. A null reward becomes NaN.
 
     Raises:
         UnreadableFile: the file is missing or damaged, or its lists differ in length.
     """
     with unreadable(path):
-        # The first versions of gym did not write these.
+        # The first versions of gym did not write these two keys.
         missing = {"initial_reset_timestamp": None, "episode_types": None}
         stats = from_json(StatsFile, {**missing, **read_object(path)})
         _check_lengths(stats)

@@ -19,7 +19,7 @@
     ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video
     ├── openaigym.video.<infix>.video000027.step000137.mp4 video of a clip
     ├── rl-video-episode-27.mp4                         second name of the first ...
-    ├── rl-video-episode-27.side.mp4                    ... and of a further one
+    ├── rl-video-episode-27.side.mp4                    ... and of another one
     ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
     ├── openaigym.states.<infix>.000000.tail            ... the last of these rows
     ├── openaigym.states.<infix>.000000.looks           ... changes to the model
@@ -35,14 +35,14 @@
     └── .openaigym.render.<number>.lock                 held while that CPU is in use
 
 The names of an episode's videos differ in the part before the suffix. A camera can have
-any name, so its part is an encoded form of the name, which cannot be mistaken for
-another part and never leads out of the directory.
+any name, so the name is encoded. The result cannot be mistaken for another part and
+never leads out of the directory.
 
-A recording in flight is a span of rows, which the journal names (see `spans`). The span
-of an episode has the name of its future trajectory. A clip has a part for each episode,
+A recording in flight is a span of rows, which the journal lists (see `spans`). An
+episode's span is named after its future trajectory. A clip has a part for each episode,
 `openaigym.clip.<infix>.step000000137.part000000`, named after the number of steps that
-the monitor had recorded when the clip began. A clip's video is named after the episode
-in which it began, with a step (`video000027.step000137.mp4`) if a step triggered it.
+the monitor had recorded when the clip began. A clip's video is named after its first
+episode, with a step (`video000027.step000137.mp4`) if a step triggered the clip.
 
 `<infix>` is `<monitor id>.<uid or process id>`. It identifies one monitor: no two
 monitors in a directory ever have the same infix. Files whose names start with a dot and
@@ -73,10 +73,10 @@ _SHOWN = 5
 _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 
 # The names that this package and all versions of gym have used. No other file in a
-# directory is ours. A name that ends in `~` is a temporary name of gym's.
+# directory is ours. A name that ends in `~` is one of gym's temporary names.
 #
 # Names are also read from files, which may be untrusted: a name with a slash would lead
-# out of the directory, and a number with a million digits takes minutes to parse.
+# out of the directory, and a number with a million digits would take minutes to parse.
 #
 # Gym accepted any string as a uid.
 _INFIX_PART = r"(?P<infix>[0-9]{1,18}\.[^/\n\0]+)"
@@ -85,8 +85,8 @@ _VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
 _TRAJECTORY = (
     rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
 )
-# The group is not called `episode`, so that no part of a clip is taken for an episode's
-# file.
+# The group is not called `episode`, so that no part of a clip is mistaken for an
+# episode's file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
 _VIDEO_FILE = re.compile(
@@ -133,7 +133,7 @@ _AMBIGUOUS = re.compile(
     r"|full|draft|annotated|plain|tiled|meta|\d*x\d*|.*fps|(video|step)\d+"
     r"|camera(-.*|\d+)"
 )
-# A file name has at most 255 bytes, and there are other parts.
+# A file name has at most 255 bytes, which all of its parts share.
 _LONGEST_PART = 80
 _DIGEST = 8
 
@@ -153,10 +153,10 @@ class VideoName:
         name: the file's name.
         infix: the monitor's infix.
         episode_id: the episode that the video shows, or in which a clip began.
-        first_step: number of recorded steps at which a clip began; None if no step
-            triggered it.
+        first_step: number of steps recorded when a clip began; None if no step
+            triggered the clip.
         view: the part of the name that distinguishes an episode's videos; empty for the
-            first camera's video as it was recorded.
+            first camera's original video.
         ending: the kind of file, such as `mp4` or `meta.json`.
     """
 
@@ -195,10 +195,10 @@ class VideoName:
 
 
 def clip_step(name: str) -> int | None:
-    """Return the step at which a clip began, from the name of one of its parts.
+    """Return the step at which a clip began, given the name of one of its parts.
 
     This is the number of steps that the monitor had recorded by then. For any other
-    name, it is None.
+    name, the result is None.
     """
     match = _CLIP_PART.fullmatch(name)
     return None if match is None else int(match["step"])
@@ -217,10 +217,10 @@ def infix_order(infix: str) -> tuple[int, int, str]:
 
 
 def check_uid(uid: object) -> str:
-    """Return `uid` as the string that goes into file names.
+    """Return `uid` as a string for use in file names.
 
     Raises:
-        InvalidArgument: `uid` would not make a portable file name.
+        InvalidArgument: `uid` is not allowed in portable file names.
     """
     text = str(uid)
     if not _UID.fullmatch(text):
@@ -277,12 +277,12 @@ def clip_prefix(infix: str, first_step: int) -> str:
 
 
 def clip_part_name(infix: str, first_step: int, number: int) -> str:
-    """Return the name of one of a clip's parts: one per episode, counted from 0."""
+    """Return the name of a clip's part. Parts are numbered from 0, one per episode."""
     return f"{clip_prefix(infix, first_step)}.part{number:06d}"
 
 
 def log_name(infix: str, number: int) -> str:
-    """Return the name of a row log; its companion files have other suffixes."""
+    """Return the name of a row log. Its companion files have other suffixes."""
     return f"{FILE_PREFIX}.states.{infix}.{number:06d}.log"
 
 
@@ -312,7 +312,7 @@ def lock_name(infix: str) -> str:
 def manifest_lock_name(infix: str) -> str:
     """Return the name of the lock file held while a manifest is rewritten.
 
-    This is not the monitor's own lock, because a closed monitor stays closed.
+    The monitor's own lock is not used, because the monitor itself stays closed.
     """
     return f".{MANIFEST_PREFIX}.{infix}.lock"
 
@@ -357,10 +357,10 @@ def is_note(name: str) -> bool:
 
 
 def unfinished_files(path: Path) -> list[Path]:
-    """Return the existing temporary files in which `path` is or was being written."""
+    """Return the existing temporary files that were created to write `path`."""
     pattern = f".{glob.escape(path.name)}.{8 * '[0-9a-f]'}.part"
     found = sorted(path.parent.glob(pattern))
-    # A link may lead anywhere.
+    # A link may point anywhere.
     return [part for part in found if part.is_file() and not part.is_symlink()]
 
 
@@ -397,9 +397,9 @@ def monitor_directories_in(directory: Path) -> list[Path]:
 
 
 def recording_directories(directory: Path) -> list[Path]:
-    """Return the directory if it has recordings, otherwise its subdirectories that do.
+    """Return a directory if it has recordings, or else its subdirectories that do.
 
-    If there are none, the directory itself is returned.
+    If there are no such subdirectories, the directory itself is returned.
     """
     if not directory.is_dir() or any(iter_monitor_files(directory)):
         return [directory]
@@ -415,7 +415,7 @@ def where_recordings_are(directory: Path) -> str:
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
-    return f"Its folders do ({listed(folders, _SHOWN)}): name one of them."
+    return f"Its subfolders do ({listed(folders, _SHOWN)}): choose one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:
@@ -445,7 +445,7 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 
 
 def _match(name: str) -> re.Match[str] | None:
-    """Return the match of a monitor file's name, or None for other files."""
+    """Match the name of a monitor file. Return None for other files."""
     if name.startswith("."):
         final = final_name(name)
         if final is not None and (match := _match(final)) is not None:
@@ -459,14 +459,14 @@ def _match(name: str) -> re.Match[str] | None:
 
 
 def name_part(text: str) -> str:
-    """Encode a string as a part of a file's name.
+    """Encode a string as a part of a file name.
 
     Every character except ASCII letters, digits, `_` and `-` is percent-encoded as
-    UTF-8. A result that is too long for a name is cut off and gets a digest at its end.
+    UTF-8. A result that is too long for a name is truncated and ends in a digest.
     """
     quoted = urllib.parse.quote(text, safe="", errors="surrogatepass")
-    # The characters that `quote` leaves alone and that are not letters, digits, `_` or
-    # `-`.
+    # Besides letters, digits, `_` and `-`, these are the only characters that `quote`
+    # does not encode.
     part = quoted.replace(".", "%2E").replace("~", "%7E")
     if len(part) <= _LONGEST_PART:
         return part
@@ -477,7 +477,7 @@ def name_part(text: str) -> str:
 
 
 def camera_part(camera: Any) -> str:
-    """Return the part of a file's name that represents one camera.
+    """Return the part of a file name that represents one camera.
 
     A name that could be mistaken for another part is prefixed, as in `camera-draft`.
 
@@ -513,7 +513,7 @@ def further_parts(cameras: Sequence[Any]) -> list[str]:
 
 
 def with_part(video: str, part: str) -> str:
-    """Return the name of a video with a part before its ending.
+    """Return a video's name with a part inserted before the extension.
 
     >>> with_part("rl-video-episode-27.mp4", "side")
     'rl-video-episode-27.side.mp4'
@@ -523,7 +523,7 @@ def with_part(video: str, part: str) -> str:
 
 
 def tiled_name(video: str) -> str:
-    """Return the name of the video that shows all sub-environments at once.
+    """Return the name of the video that shows all sub-environments together.
 
     Args:
         video: the name that the video would have otherwise.
@@ -538,7 +538,7 @@ def view_of(video: str) -> str:
     'side'
     """
     name = VideoName.parse(video)
-    # The view of a rerendered video has more than a camera's part.
+    # The view of a rerendered video contains more than a camera's part.
     return "" if name is None or "." in name.view else name.view
 
 
@@ -548,7 +548,7 @@ def is_second_name(name: str) -> bool:
 
 
 def is_called_like_second(name: str) -> bool:
-    """Return whether `name` could be a second name of any file of our videos."""
+    """Return whether `name` could be the second name of any of a video's files."""
     return _OF_SECOND_NAME.fullmatch(name) is not None
 
 

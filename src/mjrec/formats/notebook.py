@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML that shows recordings in a notebook: video players and a table.
 
-The videos are embedded in the HTML, as in mediapy, so a notebook keeps them when it is
-shared. All text comes from files, so it is escaped.
+The videos are embedded in the HTML, as in mediapy, so a shared notebook still contains
+them. All text comes from files, so it is escaped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from .regular_files import read_regular
 
-# A notebook stores every output, so videos beyond this limit are only listed by name.
+# A notebook stores every output, so videos beyond this limit are listed only by name.
 MOST_BYTES = 20_000_000
 _MOST_PLAYERS = 6
 
@@ -32,8 +32,8 @@ def shown(
     Args:
         title: the first line.
         facts: facts about the recording, by name; None values are omitted.
-        videos: the recording's videos. The first ones that fit are embedded as players,
-            and the others are only listed by name.
+        videos: the recording's videos. Those that fit are embedded as players, and the
+            others are listed only by name.
         columns: the names of a table's columns.
         rows: the table's rows.
     """

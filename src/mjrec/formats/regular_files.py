@@ -31,8 +31,8 @@ def regular_path(path: Path) -> Path:
         target = Path(os.path.realpath(path, strict=True))
         if not target.is_relative_to(os.path.realpath(path.parent)):
             raise ValueError(
-                "it is a link that leads out of its directory; put the file itself "
-                "there"
+                "it is a link that leads out of its directory: replace it with the "
+                "file itself"
             )
         path = target
     if not stat.S_ISREG(path.lstat().st_mode):

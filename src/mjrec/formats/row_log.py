@@ -2,10 +2,10 @@
 """An append-only log of fixed-size rows that survives SIGKILL without being flushed.
 
 New rows go into the tail, a small file next to the log that is mapped into the writer's
-memory. There, row i is filled in place in slot `i % capacity`, in pages that stay hot.
-A reader needs only one aligned 64-bit counter, which is incremented when a row is
+memory. Row i is filled in place, in slot `i % capacity`, in pages that stay cached. A
+reader needs only one aligned 64-bit counter, which is incremented when a row is
 complete. A full tail is written to the log, where row i begins at byte `i * row_size`,
-before a slot is reused. So at any instant, every row is in one of the two files.
+before a slot is reused. So at any time, every row is in one of the two files.
 
 The tail file begins with a page of 64-bit words: the counter, the number of words per
 row, and the number of slots. Closing the log writes its last rows and removes the tail.
@@ -34,17 +34,17 @@ _TAIL = ".tail"
 
 # The statfs(2) types of ext4, XFS, tmpfs and overlayfs, where the content of a mapped
 # page outlives the process. Some other file systems (network, FUSE, copy-on-write) lose
-# pages, or raise SIGBUS on a full disk, so there each row is written at once.
+# pages, or raise SIGBUS on a full disk. There, each row is written immediately.
 _MAPPABLE = frozenset((0xEF53, 0x58465342, 0x01021994, 0x794C7630))
 
 
 class RowLog:
-    """A writer of a row log.
+    """A writer for a row log.
 
     Args:
         path: the log; neither it nor its tail may exist.
         row_words: number of 64-bit words in a row.
-        tail_bytes: size of the tail in bytes; it holds at least four rows.
+        tail_bytes: size of the tail in bytes; at least four rows always fit.
 
     Attributes:
         path: the log.
@@ -94,7 +94,7 @@ class RowLog:
         self.limit = self.count + (self.capacity if self._is_mapped else 0)
 
     def settle(self) -> None:
-        """Write the complete rows to the log if there is no tail file to keep them.
+        """Write the complete rows to the log if no tail file preserves them.
 
         Raises:
             FileNotWritten: the disk is full; the rows stay in memory.
@@ -118,7 +118,7 @@ class RowLog:
         self.write()
         self.release()
         with contextlib.suppress(OSError):
-            # A leftover tail does no harm, because all of its rows are in the log.
+            # A leftover tail is harmless, because all of its rows are in the log.
             tail_path(self.path).unlink()
 
     def release(self) -> None:
@@ -152,7 +152,7 @@ class RowLog:
         path = tail_path(self.path)
         tail = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # Turn a full disk into an error here instead of a SIGBUS when a page is
+            # Make a full disk raise an error here, instead of a SIGBUS when a page is
             # touched.
             os.posix_fallocate(tail, 0, length)
             return mmap.mmap(tail, length)
@@ -178,7 +178,7 @@ def has_rows(log: Path) -> bool:
 
 
 class RowLogReader:
-    """A reader of a row log that may still be in use, or whose writer was killed.
+    """A reader for a row log that may still be in use, or whose writer was killed.
 
     Args:
         path: the log.
@@ -203,7 +203,7 @@ class RowLogReader:
     def count(self) -> int:
         """Number of rows so far."""
         counted, in_log = self._counted(), self._in_log()
-        # The log lacks no more rows than fit into the tail, so a larger count is wrong.
+        # The log lacks only rows that fit into the tail, so a larger count is wrong.
         return max(in_log, min(counted, in_log + self._capacity))
 
     def read(self, start: int, stop: int) -> NDArray[np.uint8]:

@@ -2,9 +2,9 @@
 """Second names of videos, such as `rl-video-episode-27.mp4`.
 
 The metadata of an episode's first video contains its second name (`also_named`). The
-name is a link in the same directory. It is created last, so that it never refers to an
-incomplete video. The episode's other videos, and the metadata of each video, get second
-names too.
+name is a link in the same directory. The link is created last, so that it never points
+to an incomplete video. The episode's other videos, and the metadata of each video, get
+second names too.
 
 If a different file has such a name, it belongs to another program, and is neither
 replaced nor removed.
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 def give_all_second_names(directory: Path) -> None:
-    """Create any missing second names of the videos in a directory.
+    """Create any missing second names for the videos in a directory.
 
     Failures are logged as warnings.
     """
@@ -42,7 +42,7 @@ def give_all_second_names(directory: Path) -> None:
 
 
 def give_second_names(video: Path) -> None:
-    """Create any second names of a finished video and its related files.
+    """Create any second names for a finished video and its related files.
 
     If another file has such a name, or a link cannot be created, a warning is logged.
 
@@ -74,14 +74,14 @@ def take_second_names(video: Path) -> None:
 
 
 def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield each file of an episode that has a second name, with that name's path."""
+    """Yield each file of an episode that has a second name, with the second path."""
     second = _said_of(video)
     if second is None:
         return
     for name in itertools.chain.from_iterable(finished_videos(video)):
         link = second_name_of(name, second, first=video.name)
         file = video.with_name(name)
-        # A file that is itself a link may lead anywhere.
+        # A file that is itself a link may point anywhere.
         if link is not None and file.is_file() and not file.is_symlink():
             yield file, video.with_name(link)
 
@@ -98,9 +98,9 @@ def _link(file: Path, link: Path) -> None:
     if os.path.lexists(link):
         if not _is_same(file, link):
             logger.warning(
-                "%s already exists and is a different file from %s, which should have "
-                "had that name too. It is left alone; give each monitor in a "
-                "directory its own name_prefix.",
+                "%s already exists and is not the same file as %s, which should also "
+                "have that name. It is left alone. Use a different name_prefix for "
+                "each monitor in a directory.",
                 link,
                 file.name,
             )
@@ -118,7 +118,7 @@ def _link(file: Path, link: Path) -> None:
 def _is_same(file: Path, link: Path) -> bool:
     """Return whether a name is a link to a file, or a copy of it.
 
-    Where a directory is copied without its hard links, they become copies.
+    If a directory is copied without its hard links, they become separate files.
     """
     try:
         return link.samefile(file) or filecmp.cmp(file, link, shallow=False)

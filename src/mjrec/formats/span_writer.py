@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writers that put a monitor's recordings into its row logs, one after another.
+"""Writers for a monitor's recordings, which go into row logs one after another.
 
-A log is used for further recordings as long as their rows have the same layout and the
-log is not too long. When a call that writes a row or a line of the journal returns, the
-operating system has the data. So a killed process loses nothing, and nothing needs to
-be flushed.
+A log is used for more recordings as long as their rows have the same layout and the log
+is not too long. When a call that writes a row or a journal line returns, the operating
+system has the data. Therefore, a killed process loses nothing, and no flush is needed.
 """
 
 from __future__ import annotations
@@ -56,8 +55,8 @@ class SpanLogs:
     Args:
         directory: the monitor directory.
         infix: the monitor's infix.
-        journal: the monitor's journal, for the rows that belong to each recording.
-        numbers: an iterator over the logs' numbers, which a monitor's logs share.
+        journal: the monitor's journal, which records the rows of each recording.
+        numbers: an iterator that numbers the logs, shared by all of a monitor's logs.
         tail_bytes: size of each log's tail in bytes.
     """
 
@@ -111,8 +110,8 @@ class SpanLogs:
             self._log = OpenLog(path, number, dtype, self._journal, tail_bytes=tail)
         log = self._log
         try:
-            # Create the log before the journal names it: a recording without a log
-            # counts as gone.
+            # Create the log before the journal mentions it, because a recording without
+            # a log counts as gone.
             said = self._say_rows(log.number, dtype, facts)
             line = _begin(log, name, facts, said)
             self._journal.note("begin", line, later=False)
@@ -135,7 +134,7 @@ class SpanLogs:
             self._log = None
 
     def release(self) -> None:
-        """Close the log's files unchanged, because a forked child does not own them."""
+        """Close the log's files without changing them."""
         if self._log is not None:
             self._log.release()
             self._log = None
@@ -165,12 +164,12 @@ class _Rows(NamedTuple):
 def _begin(
     log: OpenLog, name: str, facts: Mapping[str, Any], rows: _Rows
 ) -> dict[str, Any]:
-    """Return the facts for a begin event, without those in the rows event."""
+    """Return the facts for a begin event, leaving out those in the rows event."""
     known = rows.facts
     own = {
         key: value
         for key, value in facts.items()
-        # Most values are the very same objects in each recording.
+        # Most values are identical objects in each recording.
         if key not in known or (known[key] is not value and known[key] != value)
     }
     line = {"name": name, "log": log.number, "rows": rows.number}
@@ -180,7 +179,7 @@ def _begin(
 
 
 class OpenLog(RowLog):
-    """A row log of recordings, with the changes to their model.
+    """A row log that contains recordings and the changes to their model.
 
     Attributes:
         number: the log's number.
@@ -188,7 +187,7 @@ class OpenLog(RowLog):
         columns: views of the tail's slots by part: `state` as float64, `snapshot` as
             words, `action` and `observation`. Parts that the rows lack are missing.
         bodies: for each slot, all words after its head.
-        is_alone: whether the log is for a single recording and ends with it.
+        is_alone: whether the log is for a single recording and is closed with it.
         look_size: size in bytes of all changes to the model so far.
         recordings: all recordings that were begun in this log.
     """
@@ -228,7 +227,7 @@ class OpenLog(RowLog):
             and self._dtype == dtype
             and not self.is_alone
             and self.is_open
-            # Its file was not removed.
+            # The file has not been removed.
             and os.fstat(self._log).st_nlink > 0
         )
 
@@ -286,7 +285,7 @@ class OpenLog(RowLog):
 
 
 class SpanWriter:
-    """A writer of one recording.
+    """A writer for one recording.
 
     Args:
         log: the log for its rows.
@@ -350,8 +349,8 @@ class SpanWriter:
         flags |= (TERMINATED if terminated else 0) | (TRUNCATED if truncated else 0)
         head = rows.slots[rows.count % rows.capacity, :HEAD_WORDS]
         ROW_HEAD.pack_into(head.data.cast("B"), 0, rows.count, step, reward, flags)
-        # Do not call anything between these statements: a signal handler runs after a
-        # call and may raise, and the count must match the rows.
+        # Do not call anything between these statements: a signal handler can run after
+        # any call and raise, but the count must match the rows.
         rows.counter[0] = rows.count = rows.count + 1
         if is_step:
             self.steps = step
@@ -370,7 +369,7 @@ class SpanWriter:
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Record how the recording ended, and close its log if it has its own.
+        """Record how the recording ended, and close its log if it is not shared.
 
         Raises:
             FileNotWritten: the disk is full; the event will be written before the
@@ -382,7 +381,7 @@ class SpanWriter:
             self.log.close()
 
     def drop(self) -> None:
-        """Give up the recording's rows, and remove its log if it has its own.
+        """Discard the recording's rows, and remove its log if it is not shared.
 
         Raises:
             FileNotWritten: the disk is full; the event will be written before the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mapping from rows of a monitor's logs to recordings, read from its journal.
+"""The mapping from rows in a monitor's logs to recordings, read from the journal.
 
 A recording in flight is a span of rows: an episode, or the part of a clip in one
 episode. The journal has a line for each event::
@@ -60,7 +60,7 @@ from .video_metadata import is_done
 LOG, LOOKS = ".log", ".looks"
 
 _LONGEST_LINE = 1 << 24
-# Reading continues where it ended only if this many bytes before there are unchanged.
+# Reading resumes where it stopped only if this many preceding bytes are unchanged.
 _SEAM = 128
 
 
@@ -76,9 +76,9 @@ class Recording:
         row: the number of its first row.
         look: offset of its changes to the model in the `.looks` file.
         stop: one more than the number of its last row; None if it has not ended.
-        following: the first row of the next recording in the log; None if there is
-            none.
-        is_dropped: whether its rows were given up.
+        following: the first row of the next recording in the log; None for the last
+            recording.
+        is_dropped: whether its rows were discarded.
     """
 
     name: str
@@ -139,13 +139,13 @@ class Recording:
 
 @dataclass
 class _Spans:
-    """The events about rows in the part of a journal that was read.
+    """The events about rows in the part of a journal that has been read.
 
     Attributes:
         journal: the file.
-        logs: the recordings of each existing log, in the order of their rows.
-        recordings: the newest of these recordings, by name.
-        full: the logs that get no more rows.
+        logs: the recordings in each existing log, in the order of their rows.
+        recordings: the newest of these recordings for each name.
+        full: the logs that receive no more rows.
     """
 
     journal: Path
@@ -158,7 +158,7 @@ class _Spans:
     _seam: bytes = b""
 
     def goes_on_in(self, file: BinaryIO) -> bool:
-        """Return whether a file is the one read before, and has only grown since."""
+        """Return whether `file` is the one read before, possibly with data appended."""
         before, now = self._status, os.fstat(file.fileno())
         if before is None or (before.st_dev, before.st_ino) != (now.st_dev, now.st_ino):
             return False
@@ -168,7 +168,7 @@ class _Spans:
         return is_same or (is_longer and file.read(len(self._seam)) == self._seam)
 
     def read_on(self, file: BinaryIO) -> None:
-        """Read the rest of a file, from where the last reading ended."""
+        """Read the rest of a file, starting where the last read stopped."""
         self._status = os.fstat(file.fileno())
         file.seek(self._offset)
         began = self._offset
@@ -231,19 +231,19 @@ class _Spans:
 
 
 # Cached because a journal only grows, and recordings are looked up one at a time. Each
-# thread has its own: a shared cache would need a lock, which is unsafe with fork.
+# thread has its own cache: sharing one would require a lock, which is unsafe with fork.
 _known = threading.local()
 _MOST_KNOWN = 64
 
 
 def _read(journal: Path) -> _Spans:
-    """Return a journal's current events about rows, or none if it does not exist.
+    """Return the current events about rows in a journal, which need not exist.
 
     Raises:
         UnreadableFile: the journal cannot be read.
     """
     known: dict[Path, _Spans] = vars(_known).setdefault("spans", {})
-    # Removed from the cache first, so that an interrupted reading starts over.
+    # Removed from the cache first, so that an interrupted read starts over.
     spans = known.pop(journal, None) or _Spans(journal)
     with unreadable(journal):
         try:
@@ -289,7 +289,7 @@ def log_paths(directory: Path, infix: str | None = None) -> Iterator[Path]:
 
 
 def recordings_in(log: Path) -> list[Recording]:
-    """Return the recordings of a log, in the order of their rows.
+    """Return the recordings in a log, in the order of their rows.
 
     Raises:
         UnreadableFile: the journal cannot be read, or does not give the layout of the
@@ -343,7 +343,7 @@ def is_in_flight(path: Path) -> bool:
 
 
 def recordings_in_flight(directory: Path, infix: str | None = None) -> list[Recording]:
-    """Return the recordings of all monitors, or of one, that exist only in logs.
+    """Return the recordings of one monitor, or of all, that exist only in logs.
 
     Unreadable logs are skipped; `recordings_in` reports the reason.
     """
@@ -355,25 +355,25 @@ def recordings_in_flight(directory: Path, infix: str | None = None) -> list[Reco
 
 
 def remove_if_done(log: Path) -> None:
-    """Remove a log if it gets no more rows and none of its recordings is in flight.
+    """Remove a log if it receives no more rows and has no recordings in flight.
 
     Raises:
         DirectoryNotWritable: the log cannot be removed.
     """
-    # Checked first, because a closed monitor begins no more recordings.
+    # Check this first, because a closed monitor begins no more recordings.
     is_open = _is_open(log)
     try:
         recordings = recordings_in(log)
         is_over = not is_open or log in _read(_journal_of(log)).full
     except UnreadableFile:
         return
-    # From the last, because the first recordings are finished first.
+    # Start with the last recording, because the first ones are finished first.
     if is_over and not any(each.is_in_flight for each in reversed(recordings)):
         remove_log(log)
 
 
 def files_beside(log: Path) -> tuple[Path, ...]:
-    """Return the files of a log, in the order of their removal."""
+    """Return the files of a log, in the order in which to remove them."""
     # The log comes first, so that no reader opens it without the other files.
     return log, tail_path(log), log.with_suffix(LOOKS)
 
@@ -396,5 +396,5 @@ def _is_open(log: Path) -> bool:
     try:
         return infix is not None and is_locked(log.parent / lock_name(infix))
     except OSError:
-        # This is unknown, so leave the log's files alone.
+        # Its monitor may be open, so leave the log's files alone.
         return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a trajectory, however it is stored.
+"""The content of a trajectory, independent of how it is stored.
 
 A recorded episode is first a span of the monitor's row log (`trajectory_log`), and then
 an HDF5 file (`trajectory_hdf5`). Both contain facts, rows and changes to the model. A
@@ -59,12 +59,12 @@ def row_dtype(
     action: np.dtype[Any] | None = None,
     observation: np.dtype[Any] | None = None,
 ) -> np.dtype[Any]:
-    """Return the dtype of a row, without parts that are None or empty.
+    """Return the dtype of a row, leaving out parts that are None or empty.
 
     Args:
         state: dtype of a state, with a float64 member for each of MuJoCo's components.
-        snapshot: dtype of a snapshot, with a member for each of MuJoCo's arrays that
-            are needed to render a frame.
+        snapshot: dtype of a snapshot, with a member for each MuJoCo array needed to
+            render a frame.
         action: dtype and shape of an action.
         observation: dtype and shape of an observation.
 
@@ -79,7 +79,7 @@ def row_dtype(
         check_dtype(kind.base)
     kinds = [] if state is None else [(n, state[n].shape) for n in state.names or ()]
     if kinds and state != packed((name, ("<f8", shape)) for name, shape in kinds):
-        raise ValueError("the state is not all float64")
+        raise ValueError("the state has components that are not float64")
     return packed((*_HEAD, *members))
 
 
@@ -137,7 +137,7 @@ class ModelChange:
     Attributes:
         step: the first step that the values apply to; 0 for differences from the stored
             model at the reset.
-        fields: the new values by name. The names are those of `MjModel`'s arrays
+        fields: the new values, keyed by name. The names are those of `MjModel`'s arrays
             (`geom_rgba`), of members of its structs (`opt.gravity`,
             `vis.headlight.ambient`, `stat.extent`), and of parts of the view
             (`camera.lookat`, `option.flags`).
@@ -152,17 +152,17 @@ def check_version(version: int) -> None:
     if version != FORMAT_VERSION:
         raise ValueError(
             f"it was written by a newer mjrec in format version {version}, but this "
-            f"mjrec only reads versions up to {FORMAT_VERSION}: update mjrec"
+            f"mjrec reads only versions up to {FORMAT_VERSION}: update mjrec"
             if version > FORMAT_VERSION
             else f"format version {version} does not exist"
         )
 
 
 def added_up(rewards: ArrayLike) -> float:
-    """Return the sum of rewards, adding one after another as a monitor does.
+    """Return the sum of rewards, adding them one by one as a monitor does.
 
-    Other functions give different last bits: from Python 3.12 on, `sum` compensates for
-    rounding errors, and NumPy adds in pairs.
+    Other functions may differ in the last bits: from Python 3.12 on, `sum` compensates
+    for rounding errors, and NumPy adds in pairs.
     """
     values = np.asarray(rewards, np.float64)
     # Add the sum to 0.0, as a monitor does, which turns negative zero into zero.
@@ -175,7 +175,7 @@ class TrajectoryReader:
     """An open trajectory with T steps and F video frames.
 
     Rows are read on demand, in ranges `start, stop` as in Python slices. Use a reader
-    on only one thread, in the process that opened it.
+    from only one thread, in the process that opened it.
 
     Attributes:
         path: the file.

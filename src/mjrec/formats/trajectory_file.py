@@ -45,10 +45,10 @@ def open_trajectory(path: Path) -> TrajectoryReader:
 
 
 def finish_trajectory(path: Path) -> Path:
-    """Create the HDF5 file of an ended recording, and remove its log if it is done.
+    """Create an ended recording's HDF5 file, and remove its log if no longer needed.
 
     If the end of a recording was not recorded, the process was killed or the disk was
-    full; the last row then shows whether the recording is complete. This function can
+    full. The last row then shows whether the recording is complete. This function can
     be killed at any point and run again, and two processes can run it at the same time,
     because the rows stay until the file exists.
 
@@ -79,7 +79,7 @@ def finish_trajectory(path: Path) -> Path:
 
 
 def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
-    """Finish the recordings that are in flight, and return the errors by path."""
+    """Finish the recordings that are in flight, and return the errors keyed by path."""
     failures: dict[Path, Error] = {}
     for path in paths:
         try:
@@ -91,7 +91,7 @@ def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
 
 
 def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
-    """Finish recordings by adding them to their monitor's bundle all at once.
+    """Finish recordings by adding them to their monitor's bundle in one step.
 
     Call this only in the process that holds the monitor's lock.
 
@@ -99,7 +99,7 @@ def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
         paths: the trajectories' own files, all from one monitor.
 
     Returns:
-        The error of each trajectory that could not be added, by path.
+        The error for each trajectory that could not be added, keyed by path.
     """
     recordings: dict[Path, Recording] = {}
     failures: dict[Path, Error] = {}
@@ -126,11 +126,11 @@ def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
     """Change the facts of finished trajectories.
 
     Each file is atomically rewritten as a whole, so use this rarely. Only data that
-    this package writes is kept; the arrays stay the same, bit for bit.
+    this package writes is kept. The arrays stay the same, bit for bit.
 
     Args:
-        changes: functions that take a trajectory's facts and return the new facts, by
-            the path of the trajectory's own file.
+        changes: functions that take a trajectory's facts and return the new facts,
+            keyed by the path of the trajectory's own file.
 
     Raises:
         UnreadableFile: the file is missing or damaged.

@@ -6,7 +6,7 @@ An episode has a file of its own, or a group in a bundle (see `bundle`).
 `docs/reference/trajectories.md` describes every dataset. States and snapshots are rows
 of a compound type, whose members have MuJoCo's names: `file["states"]["qpos"]` is an
 array. The shuffle filter works on whole rows: it stores the same byte of consecutive
-rows next to each other, so values that do not change cost nothing.
+rows next to each other, so values that do not change take almost no space.
 
 This module does not limit the memory or time that reading a file takes, but
 `foreign_files` does.
@@ -66,7 +66,7 @@ _COLUMNS = {
 _NO_STATE = np.dtype(("<f8", (0,)))
 
 _CHUNK_BYTES = 1 << 18
-# For snapshots. Few rows per chunk, so that reading a frame does not read many others.
+# For snapshots: small chunks, so that reading a frame does not read many others.
 _ROWS_IN_CHUNK = 32
 # Number of bytes that are buffered while writing.
 _BUFFER_BYTES = 1 << 22
@@ -98,13 +98,13 @@ def write_bundle(
 
     Args:
         bundle: the bundle's file, which need not exist yet.
-        added: functions that open the new trajectories, by the path of each
+        added: functions that open the new trajectories, keyed by the path of each
             trajectory's own file.
         amended: functions that take the facts of existing trajectories and return the
-            new facts, by path.
+            new facts, keyed by path.
 
     Returns:
-        The errors of trajectories that could not be read and were not added, by path.
+        The errors for trajectories that could not be read or added, keyed by path.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
@@ -155,7 +155,7 @@ def _new_file(
     """Yield a new HDF5 file, and the raw file that it is written through.
 
     Args:
-        path: the path that the file gets at the end of the block.
+        path: the file's final path, which it gets at the end of the block.
         on_signal: called immediately if a signal arrives during the block.
         **options: additional options for `h5py.File`.
 
@@ -212,8 +212,8 @@ class _Unfailing(io.RawIOBase):
     """A file whose writes never fail, for the HDF5 library.
 
     The library does not survive a failed write: it crashes the process when it closes
-    the remaining objects. So data that the disk has no room for is held in memory, and
-    `error` is set.
+    the remaining objects. Therefore, data that does not fit on the disk is kept in
+    memory, and `error` is set.
     """
 
     def __init__(self, file: io.FileIO) -> None:
@@ -296,7 +296,7 @@ def _reader_of(
     if not all(lengths) or (rows != steps + 1 and (rows, steps) != (0, 0)):
         raise ValueError("its datasets do not have the same number of steps")
     last = max(rows - 1, 0)
-    # Compare instead of subtracting: differences of such numbers may overflow.
+    # Compare instead of subtracting, because the differences may overflow.
     bounds = np.concatenate(([0], columns["frame_steps"], [last]))
     if (bounds[1:] < bounds[:-1]).any():
         raise ValueError("its frame steps are out of order or out of range")
@@ -351,7 +351,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _linked(group: h5py.Group, name: str) -> Any:
-    # Links may lead to other files of the user who reads this one.
+    # Links may point to other files of the user who reads this file.
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"it has no {name!r} of its own")
     return group[name]
@@ -462,7 +462,7 @@ def _store(
     packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
     # Write whole chunks at a time.
     step = max(1, _BUFFER_BYTES // size // chunk) * chunk
-    # Creating it with its values, if they fit, takes two thirds of the time.
+    # If all values fit, creating the dataset with them takes only two thirds as long.
     whole = read(0, count) if count <= step else None
     dataset = file.create_dataset(name, shape, kind.base, whole, **packing)
     for start in range(0, count if whole is None else 0, step):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reader of recordings in flight, which works even after their process has died.
+"""A reader for recordings in flight, which works even if their process has died.
 
-A row is valid only if it contains its own number, because after a machine crash, a log
-may have pages without the data that was written to them.
+A row is valid only if it contains its own number, because after a machine crash, pages
+of a log may lack the data that was written to them.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from .trajectory import (
 # Every row has a step, a frame, or both.
 _KINDS = STEP | FRAME
 
-# Number of bytes read at once when scanning the rows.
+# Number of bytes read at a time when scanning the rows.
 _CHUNK_BYTES = 1 << 22
 
-# The header of a change to the model: the row from which it applies, its step, and the
-# length of the record after it.
+# The header of a change to the model: the first row to which it applies, its step, and
+# the length of the record after the header.
 _CHANGE = struct.Struct("<QqQ")
 _LONGEST_HEADER = 1 << 16
 _LARGEST_CHANGE = 1 << 30
@@ -82,14 +82,14 @@ def _reader_of(
     log, dtype = recording.log, recording.dtype
     first, stop = recording.row, recording.stop
     if stop is None:
-        # A recording without an end extends to the next one, if there is one.
+        # A recording without an end event extends to the next recording, if any.
         stop = count if recording.following is None else recording.following
     stop = max(first, min(stop, count))
     heads = _sound_heads(rows, dtype, first, stop)
     is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
     places = {
         **dict.fromkeys(("state", "observation"), first + np.flatnonzero(is_step)),
-        # The row of step k has the action that led to it; the reset's row has none.
+        # The row of step k has the action that led to it. The reset's row has none.
         "action": first + np.flatnonzero(is_step)[1:],
         "snapshot": first + np.flatnonzero(is_frame),
     }
@@ -161,13 +161,13 @@ def _read_part(
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
     start = 0
     while start < len(wanted):
-        # The rows between the wanted rows are read too.
+        # Rows between the requested rows are read too.
         stop = int(np.searchsorted(wanted, wanted[start] + at_once))
         chosen = wanted[start:stop]
         first, behind = int(chosen[0]), int(chosen[-1]) + 1
         found = rows.read(first, behind).view(dtype)[:, 0]
         if (found["row"] != np.arange(first, behind)).any():
-            raise ValueError("its log was changed while it was read")
+            raise ValueError("its log was changed while being read")
         values = found[part][chosen - first]
         # Copy member by member, because the padding between members contains data.
         for name in member.names or ():
@@ -182,8 +182,8 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
     try:
         return opened.enter_context(open_regular(recording.log.with_suffix(LOOKS)))
     except FileNotFoundError:
-        # If the whole log was removed, this raises an error: the log is removed before
-        # its looks.
+        # If the whole log was removed, this raises an error, because the log is removed
+        # before its `.looks` file.
         recording.log.lstat()
         return None
 

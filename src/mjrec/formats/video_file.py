@@ -42,7 +42,7 @@ class VideoFile:
         encoder: facts about ffmpeg: `ffmpeg` (the binary's base name), `version` (the
             first line of its version output), `sha256` (of the binary) and `arguments`
             (all arguments, with only the base name of the output file, so that they
-            stay true if the directory moves).
+            stay valid if the directory is moved).
         frame_hash_path: the `.framehash` file, if requested.
         frame_count: number of frames in the file, counted by decoding it.
         file_sha256: SHA-256 of the file's bytes.
@@ -148,7 +148,7 @@ class Encoding:
                 what=f"The video {file.path} could not be encoded.",
                 reads=True,
                 # ffmpeg shares the lock. If this process dies, ffmpeg holds the lock
-                # until it ends.
+                # until ffmpeg ends.
                 keeps=self._lock.fileno(),
             )
             on_failure.callback(self._process.release)
@@ -165,7 +165,7 @@ class Encoding:
     def finish(self) -> VideoFile:
         """Complete the file, check it and rename it to its final name.
 
-        Can be called again after Ctrl-C has interrupted it.
+        After Ctrl-C, call this method again to continue.
         """
         self.is_ending = True
         self.thread.close()
@@ -222,7 +222,7 @@ class Encoding:
             self._wait_and_close()
 
     def _wait_and_close(self) -> None:
-        """Wait for ffmpeg after the end of its input. Another process owns its file."""
+        """Wait for ffmpeg to end. Its file is left for another process to finish."""
         if self._hashes is not None:
             self._hashes.close()
         with contextlib.suppress(EncoderError):
@@ -245,7 +245,7 @@ class Encoding:
         if found["frame_count"] != self._encoded:
             raise FrameCountError(
                 f"{file.path} should contain {self._encoded} frames, but decoding "
-                f"gives {found['frame_count']}. It was not kept.",
+                f"it gives {found['frame_count']}. The file was not kept.",
                 command=self._process.command,
                 returncode=0,
                 stderr="",

@@ -29,12 +29,12 @@ _CUT = " [...] "
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
-# Keys about a finished file that metadata takes from a `VideoFile`.
+# Metadata keys about a finished file, taken from a `VideoFile`.
 _OF_FILE = (
     *("height", "width", "padded_height", "padded_width", "codec", "pixel_format"),
     *("file_sha256", "decoded_sha256"),
 )
-# Keys about the episode that metadata takes from a recording's facts.
+# Metadata keys about the episode, taken from a recording's facts.
 _OF_EPISODE = ("episode_id", "type", "env_id", "seed", "options", "versions")
 
 
@@ -117,8 +117,8 @@ def timing_facts(
 def file_facts(file: VideoFile) -> dict[str, Any]:
     """Return the metadata about a finished file and its encoding."""
     return {
-        # gym's three keys; the command line contains no directory, so that it stays
-        # true when the recordings are moved.
+        # gym's three keys. The command line contains no directory, so it stays valid
+        # when the recordings are moved.
         "encoder_version": {
             "backend": "ffmpeg",
             "version": file.encoder["version"],
@@ -160,7 +160,7 @@ def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
 def finished_videos(video: Path) -> list[tuple[str, str]]:
     """Return the names of an episode's finished videos and of their metadata files.
 
-    The first video comes first; it must exist. Its metadata, which is written last,
+    The first video, which must exist, comes first. Its metadata, which is written last,
     lists the videos from additional cameras (`further_videos`). The list is untrusted,
     so only names that belong to this episode are accepted.
 
@@ -180,8 +180,8 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
 def further_live_videos(video: Path) -> list[str]:
     """Return the names of an episode's live videos from additional cameras.
 
-    This is for readers that have nothing but these files. Videos that were rendered
-    from a trajectory are excluded, because their metadata does not say "live".
+    This is for readers that have only these files. Videos that were rendered from a
+    trajectory are excluded, because their metadata does not say "live".
 
     Args:
         video: the first video of the episode, which need not exist.
@@ -195,7 +195,7 @@ def further_live_videos(video: Path) -> list[str]:
 
 
 def is_done(video: Path) -> bool:
-    """Return whether a video needs no more work: it is finished, or was given up."""
+    """Return whether a video needs no more work because it is finished or given up."""
     metadata = metadata_path(video)
     return metadata.exists() and (video.exists() or is_broken(metadata))
 
@@ -223,19 +223,19 @@ def _is_further(name: str, video: Path) -> bool:
 
 
 def failure_path(video: Path) -> Path:
-    """Return the path of the file with the reason why a video could not be rendered.
+    """Return the path of the file that states why a video could not be rendered.
 
     The file contains `{"reason": "no OpenGL backend works here: ..."}`. It is written
     when rendering fails, and removed once the video exists.
 
     Args:
-        video: the video, or a part of a clip, whose video may not be known.
+        video: the video, or a part of a clip if the clip's video may be unknown.
     """
     return video.with_suffix(_FAILED)
 
 
 def note_failure(video: Path, reason: str) -> None:
-    """Record why a video could not be rendered. Errors in recording it are ignored."""
+    """Record why a video could not be rendered. Errors while doing so are ignored."""
     with contextlib.suppress(Error, OSError):
         text = json_text.dumps({"reason": _shortened(reason)})
         write_text(failure_path(video), text)

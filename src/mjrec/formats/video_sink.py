@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sink for all frames, live and deferred: frames in, one finished video out.
+"""A sink that turns frames, whether live or deferred, into one finished video.
 
 Images become an mp4 file with frame hashes, and text becomes an asciicast. The metadata
 file is written last: if it exists, the video is complete.
@@ -32,15 +32,15 @@ _Note = Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]
 
 
 class VideoSink:
-    """A writer of one video and its companion files from a stream of frames.
+    """A writer that turns a stream of frames into a video and its companion files.
 
     Args:
         path: the video: `.mp4` for images, `.json` for text.
         fps: frames per second.
         frame_hashes: whether to write the `.framehash` file of images.
-        note: a function that returns the metadata and the timing known so far. They go
-            into the note about the unfinished mp4 file, which another process needs to
-            finish it if this one is killed. If None, no note is written; use this if
+        note: a function that returns the metadata and the timing known so far, for the
+            note about the unfinished mp4 file. Another process needs the note to finish
+            the file if this process is killed. If None, no note is written; use this if
             the video can be rendered again.
 
     Raises:
@@ -48,7 +48,7 @@ class VideoSink:
 
     Attributes:
         path: the video.
-        blank: the check whether the frames show anything.
+        blank: checks whether the frames show anything.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class VideoSink:
         self.blank.add(frame)
 
     def finish(self) -> None:
-        """Give the video its final name. Call again to continue after an interrupt.
+        """Complete the video. After an interrupt, call this method again to continue.
 
         Raises:
             Error: see `VideoWriter.close`.

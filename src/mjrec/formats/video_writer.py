@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writers of videos that contain every frame once, in order, and play everywhere.
+"""Writers for videos that contain every frame once, in order, and play everywhere.
 
 Frames go through a bounded queue to a thread that feeds ffmpeg. The caller waits if the
 encoder is slower, so no frame is lost. The file has a temporary name until it is
@@ -51,8 +51,8 @@ class VideoWriter:
                 video.write(frame)
 
     By default, the video is H.264 (High profile, yuv420p, bt709), which every browser
-    plays. With the same ffmpeg, the same frames give the same file, byte for byte, on
-    any CPU.
+    plays. With the same ffmpeg, the same frames produce the same file, byte for byte,
+    on any CPU.
 
     An existing file is replaced when the new one is complete. If no frame is written,
     there is no file and no error. If an exception escapes the `with` block, the file is
@@ -64,13 +64,13 @@ class VideoWriter:
         fps: frames per second. A fraction is stored exactly; a float becomes the
             nearest fraction with a numerator and denominator of at most a million.
         crf: quality, from 0 (largest file) to 51 (worst). None means 18, which looks
-            like the original. Below 1, x264 is lossless except for colour conversion,
+            like the original. Below 1, x264 is lossless except for color conversion,
             but browsers cannot play the file.
         codec: ffmpeg's name for an encoder. None means libx264. Lossless RGB encoders
             (`ffv1` and `libx264rgb` in `.mkv`) keep every pixel.
         frame_hashes: whether to write the SHA-256 of each frame to a `.framehash` file
             with the video's name.
-        encoder_arguments: further output arguments for ffmpeg.
+        encoder_arguments: additional output arguments for ffmpeg.
 
     Attributes:
         path: the file.
@@ -212,7 +212,7 @@ class VideoWriter:
         self.closed = True
 
     def abort(self) -> None:
-        """Stop at once without leaving a new file; an older file stays. Idempotent."""
+        """Stop immediately, leaving no new file. An older file is kept. Idempotent."""
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.abort()
         self.closed = True
@@ -242,7 +242,7 @@ class VideoWriter:
         # finishes its file under the temporary name.
         self.leave()
         warnings.warn(
-            f"The VideoWriter of {self.path} was never closed; its frames are in "
+            f"The VideoWriter for {self.path} was never closed; its frames are in "
             f"{self.temporary}. Use it in a with statement.",
             ResourceWarning,
             source=self,
@@ -277,7 +277,7 @@ def save_video(
     `<prefix>-episode-<episode_index>.mp4` contains the episode if `episode_trigger`
     selects it. `<prefix>-step-<n>.mp4` starts with the frame of step n if
     `step_trigger` selects that step. The first frame belongs to the reset, and the
-    second to step `step_starting_index`. No frame is left out of a file.
+    second to step `step_starting_index`. No frames are left out.
 
     `frames` can be any iterable. With only an episode trigger, it is streamed up to
     `video_length`, and it is not read at all if no video is due. With a step trigger,
@@ -343,8 +343,8 @@ def _check_options(options: dict[str, Any], video_length: object) -> None:
             raise UnknownName("option of save_video", name, known)
     if "fps" not in options:
         raise InvalidArgument(
-            "save_video needs fps, the frames per second of the video: "
-            "fps=env.metadata['render_fps'], for example."
+            "save_video needs fps, the video's frames per second, for example "
+            "fps=env.metadata['render_fps']."
         )
     to_rate(options["fps"])
     is_number = isinstance(video_length, int) and not isinstance(video_length, bool)

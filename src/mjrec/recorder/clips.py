@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clips: videos of N steps, which may cross episodes.
 
-A clip may continue across resets, but a recording belongs to one episode. Therefore a
-clip has one recording, called a part, for each episode that it touches. The field
+A clip may continue across resets, but a recording belongs to one episode. Therefore, a
+clip has one recording, called a part, for each episode that it overlaps. The field
 `clip` in a part's facts has these keys:
 
 - `first_step`: number of steps that the monitor had recorded when the clip began
@@ -11,8 +11,8 @@ clip has one recording, called a part, for each episode that it touches. The fie
 - `reward_before`: sum of the rewards of these steps
 - `reset_time`: simulated time of the episode's reset, if frames show the time
 
-The facts at the end of the last part contain `complete`, as at the end of an episode's
-trajectory. At the end of earlier parts they contain `continues`.
+The final facts of the last part contain `complete`, like those of an episode's
+trajectory. The final facts of earlier parts contain `continues`.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Clips:
         """Take the first frame of an episode that has just begun.
 
         Args:
-            is_chosen: whether to begin a clip with the episode. Ignored while a clip is
-                running.
+            is_chosen: whether to begin a clip with the episode. This is ignored while a
+                clip is running.
         """
         if self._clip is not None:
             self._clip.reset()
@@ -114,8 +114,8 @@ class _Clip:
 
     Args:
         run: the monitored run.
-        taken: number of steps so far if a step began the clip; None if an episode began
-            it.
+        taken: number of steps so far if a step triggered the clip; None if it began
+            with an episode.
 
     Attributes:
         steps: number of steps in the clip.
@@ -198,7 +198,7 @@ class _Clip:
                 run.note("clip", {**said, "recording": LIVE})
                 run.trackers.expect(self._video)
                 self.live.name_again()
-            # Otherwise the disk was too full for even a single row, and there will be
+            # Otherwise, the disk was too full for even a single row, and there will be
             # no video.
             elif self._parts > 1 or (self._part is not None and self._part.is_there):
                 run.note("clip", {**said, "clip": self._name(0)})

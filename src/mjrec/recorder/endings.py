@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reasons why an episode ended early, and a guard that closes no later than at exit."""
+"""Reasons why an episode ended early, and a guard that ensures closing at exit."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def ending(error: BaseException) -> dict[str, Any]:
     """Return the facts about an early end that an exception caused.
 
     Returns:
-        A dictionary with the key `reason`, which is "close" if the program left in an
-        ordinary way (`sys.exit()`). If the reason is "exception", the key
+        A dictionary with the key `reason`, which is "close" if the program exited
+        normally (`sys.exit()`). If the reason is "exception", the key
         `exception` holds the exception's `type` (its module and name, or only its name
         if it is built in) and its `message`.
     """
@@ -45,12 +45,12 @@ def last_error() -> BaseException | None:
     """Return the exception that is ending this process, if it can be found.
 
     At exit, the interpreter has already printed and stored the exception. In an
-    interactive session, the stored exception is not evidence, because exceptions do not
+    interactive session, the stored exception proves nothing, because exceptions do not
     end such a session.
     """
     if hasattr(sys, "ps1"):
         return None
-    # `last_exc` exists since Python 3.12.
+    # `last_exc` was added in Python 3.12.
     error = getattr(sys, "last_exc", None) or getattr(sys, "last_value", None)
     return error if isinstance(error, BaseException) else received()
 
@@ -106,8 +106,8 @@ class ExitGuard:
         owner: the object whose garbage collection triggers `close`.
         close: the function to call. It must not refer to `owner`, because `owner` would
             then never be collected.
-        at_exit: function to call before `close` at interpreter exit. It must not refer
-            to `owner` either.
+        at_exit: a function to call before `close` at interpreter exit. It must not
+            refer to `owner` either.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ExitGuard:
         self._close = close_here = _in_process(os.getpid(), close)
         self._finalize = finalize = weakref.finalize(owner, _aside, close_here)
         # weakref registers its exit hook when it is first used in the process. Newer
-        # hooks run first, so simulators would tear down OpenGL before this hook.
+        # hooks run first, so a simulator's hook would tear down OpenGL before this one.
         finalize.atexit = False
         self._first = False
 
@@ -130,14 +130,14 @@ class ExitGuard:
                 try:
                     finalize()
                 except Error as error:
-                    # Python would print a traceback of its own machinery.
+                    # Python would print a traceback of its internal code.
                     logger.error("%s", error)
 
         self._at_exit = exit_hook
         atexit.register(exit_hook)
 
     def run_first_at_exit(self) -> None:
-        """Move this guard's exit hook before all hooks so far. Works only once."""
+        """Move this guard's exit hook ahead of all existing hooks. Works only once."""
         if not self._first and self._finalize.alive:
             self._first = True
             atexit.unregister(self._at_exit)
@@ -163,7 +163,7 @@ def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
 
 
 def _aside(close: Callable[[], None]) -> None:
-    """Call `close`, using a new thread if the current thread is one of this package.
+    """Call `close`, using a new thread if this package created the current one.
 
     Garbage collection can run on any thread that allocates memory. Closing waits for
     the encoder's thread, so it must not run on that thread.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice of episodes that get a video or keep their trajectory, as they begin."""
+"""The decision, as each episode begins, whether it gets a video or a trajectory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EVALUATION = "e"
 
 
 class EpisodeChoice:
-    """Decides what to record of an episode when it begins, based on the options.
+    """Decides what to record when an episode begins, based on the options.
 
     A user's function is called only once per episode number, even if several resets
     have the same number.
@@ -34,7 +34,7 @@ class EpisodeChoice:
             chosen when they begin.
         schedule_name: the schedule's name in the manifest.
         has_videos: whether any episode may get a video of its own.
-        decide: function that returns whether an episode gets a video.
+        decide: a function that returns whether an episode gets a video.
     """
 
     def __init__(self, options: RecorderOptions, *, draws: bool) -> None:

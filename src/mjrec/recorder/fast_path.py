@@ -3,8 +3,8 @@
 
 A step of a fast simulation takes as long as a few hundred lines of Python. Nearly all
 steps change only the state: there is no error, the episode does not end, and the model
-and the view stay the same. While a recorder has a `FastPath`, its functions are called
-instead of `Recorder.before_step` and `Recorder.step`. If a function returns False, it
+and the view stay the same. While a recorder has a `FastPath`, the functions in it are
+called instead of `Recorder.before_step` and `Recorder.step`. If one returns False, it
 has recorded nothing, and the caller must call the recorder's method of the same name.
 """
 
@@ -35,9 +35,9 @@ class FastPath(NamedTuple):
 
     Attributes:
         before_step: stores the action and returns whether a step may be taken.
-        step: counts and records a step, given its reward and, as keywords, whether it
-            was `terminated` or `truncated`. It returns False if the step is unusual and
-            was not recorded. The recorder itself handles the end of an episode.
+        step: counts and records a step, given its reward and the keywords `terminated`
+            and `truncated`. It returns False if the step is unusual and was not
+            recorded. The recorder itself handles the end of an episode.
     """
 
     before_step: Callable[[Any], bool]
@@ -74,24 +74,24 @@ def gathering(
     is_on_pace: Callable[[float], bool],
     stride: int,
 ) -> FastPath:
-    """Return a fast path that records each step with one copy of memory.
+    """Return a fast path that records each step with a single memory copy.
 
     Args:
         stats: the recorder that counts the steps.
         span: the recording, which already has its first row.
         words: indices into `WORDS` for the content of a row after its head.
-        set_action: function that copies the action into the gathered memory. It returns
-            False if the type or shape of the action differs from before.
-        is_current: function that returns, after a step, whether only the state has
+        set_action: a function that copies the action into the gathered memory. It
+            returns False if the type or shape of the action differs from before.
+        is_current: a function that returns, after a step, whether only the state has
             changed.
-        is_on_pace: function that returns, given the time after the first step, whether
-            the step took the expected simulated time.
-        stride: number of steps per frame. The last step gets a frame in any case.
+        is_on_pace: a function that returns, given the time after the first step,
+            whether the step took the expected simulated time.
+        stride: number of steps per frame. The last step always gets a frame.
     """
     log, bodies = span.log, span.log.bodies
     take, both = WORDS.take, STEP | FRAME
-    # The simulation evicts our code from the CPU's caches. In that case, assigning an
-    # item is cheaper than `struct`.
+    # Between steps, the simulation evicts our code from the CPU's caches. In that case,
+    # assigning an item is cheaper than using `struct`.
     whole, floats = memoryview(log.memory).cast("q"), memoryview(log.memory).cast("d")
     capacity, width, first = log.capacity, log.row_size // 8, TAIL_HEAD // 8
 

@@ -18,11 +18,11 @@ class Finisher(Protocol):
 
         Args:
             recording: the recording, once it has begun. Later recordings will most
-                likely be drawn in the same way.
+                likely be drawn the same way.
         """
 
     def submit(self, recording: Path) -> None:
-        """Accept the trajectory of an ended episode or the first part of a clip.
+        """Accept the trajectory of an ended episode, or the first part of a clip.
 
         Never waits.
         """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules for `keep`, which chooses episodes for videos based on their results.
 
-A rule is one or more of these, separated by commas:
+A rule consists of one or more of the following, separated by commas:
 
 ==============  ======================================================================
 `best[:N]`      the N episodes with the highest return; N defaults to 1
@@ -45,7 +45,7 @@ from ..plain_text import listed
 from ..schedules import capped_cubic_video_schedule, check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
-# The most episode numbers that a message lists.
+# Maximum number of episode numbers listed in a message.
 _SHOWN = 10
 RULES = ("best", "best:N", "worst", "worst:N", "median", "failures", "failures:N")
 RULES_OF_EVALUATIONS = (*RULES, "cubic", "all", "none")
@@ -69,7 +69,7 @@ class Ended(Protocol):
 
     @property
     def success(self) -> bool | None:
-        """Whether the episode was a success; None if the environment does not say."""
+        """Whether the episode was successful; None if that is not reported."""
 
 
 _E = TypeVar("_E", bound=Ended)
@@ -172,8 +172,8 @@ def has_failed(episode: Ended) -> bool:
     """Return whether an episode is a failure.
 
     An episode is a failure if it could not be completed or if the environment reports
-    no success. If the environment does not report success at all, a terminated episode
-    is a failure, which is right for tasks that end when the robot falls.
+    that it was unsuccessful. If the environment does not report success, a terminated
+    episode is a failure, which suits tasks that end when the robot falls.
     """
     if episode.reward is None:
         return True
@@ -233,8 +233,8 @@ class Selection:
 
     Attributes:
         name: the rule's name in the manifest.
-        choose: function that takes episodes and returns the numbers of the chosen ones;
-            None if only failures are chosen.
+        choose: a function that takes episodes and returns the numbers of the chosen
+            ones; None if only failures are chosen.
         holds_all: whether `choose` is called only once, at the end. Otherwise it is
             called after each episode, and an episode that it has rejected must remain
             rejected when more episodes are added.
@@ -259,7 +259,7 @@ class Selection:
         self.__qualname__ = f"keep:{self.name}"
 
     def __call__(self, episode_id: int) -> bool:
-        """Return whether to record an episode as if it got a video."""
+        """Return whether to record an episode as if it were to get a video."""
         return self.choose is not None or self._has_room
 
     def add(self, episode: FinishedEpisode) -> None:
@@ -311,7 +311,7 @@ class Selection:
 
         Raises:
             InvalidArgument: the user's function raised an exception or did not return
-                numbers of finished episodes. In that case no decision is made.
+                numbers of finished episodes. In that case, no decision is made.
         """
         if self.choose is not None and not self._is_closed:
             self._chosen.update(self.choose([*self._candidates.values()]))

@@ -27,8 +27,8 @@ class LiveVideos:
         run: the monitored run.
         recorders: the video recorders, in the order of the cameras. There must be at
             least one.
-        tolerates: function that returns whether to continue after an error; None for
-            the run's own.
+        tolerates: a function that returns whether to continue after an error; None for
+            the run's own function.
 
     Attributes:
         recorders: the video recorders.
@@ -51,11 +51,11 @@ class LiveVideos:
         return Path(str(self.recorders[0].path))
 
     def begin(self) -> None:
-        """Take the frames of the reset."""
+        """Take the frames for the reset."""
         self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take the frames of a step.
+        """Take the frames for a step.
 
         Args:
             is_there: whether the frames still exist. False if the environment has
@@ -99,8 +99,8 @@ class LiveVideos:
         """Finish the files.
 
         The metadata of the first camera's video lists the other videos and implies that
-        all of them exist. Therefore it is written last, even if an error occurs while
-        another video is finished.
+        all of them exist. Therefore, it is written last, even if an error occurs while
+        finishing another video.
 
         Args:
             facts: the facts about the episode for the metadata.
@@ -123,7 +123,7 @@ class LiveVideos:
                 self.end(facts)
                 self.name_again()
 
-            # The disk had no room for some metadata.
+            # The disk had no room for some of the metadata.
             self._run.retry_at_close(end_again)
         failures.raise_first()
 
@@ -213,13 +213,13 @@ def live_recorder(
     caption: Callable[[], Caption] | None = None,
     **facts: Any,
 ) -> VideoRecorder:
-    """Create the recorder of one live video with the run's options.
+    """Create the recorder for one live video with the run's options.
 
     Args:
         run: the monitored run.
         base_path: path of the video, without the extension.
         frames: the source of the frames.
-        caption: returns the text to write on the current frame, or None.
+        caption: a function that returns the text for the current frame, or None.
         **facts: additional facts for the metadata.
     """
     return VideoRecorder(

@@ -55,9 +55,9 @@ class RunningEpisode(NamedTuple):
         start_time: time just before the reset, in seconds since the Unix epoch.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
-        random_state: state of the environment's random generator before the reset, as
-            JSON values; None if unknown or not needed.
-        reset_clock: simulated time of the reset, if frames show the time.
+        random_state: state of the environment's random number generator before the
+            reset, as JSON values; None if unknown or not needed.
+        reset_clock: simulated time at the reset, if frames show the time.
     """
 
     episode_id: int
@@ -71,7 +71,7 @@ class RunningEpisode(NamedTuple):
 
 @dataclass
 class Track:
-    """The states of episodes, or those of clips, which overlap with episodes.
+    """The capture and the logs for either the episodes or the clips of a run.
 
     Attributes:
         logs: the logs for the rows.
@@ -91,7 +91,7 @@ What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker
 
 
 class MonitoredRun:
-    """What all recordings of a run share: its state, and the facts for their files.
+    """The state shared by all recordings of a run, and the facts for their files.
 
     It writes the run's journal. With `on_error="raise"`, the caller raises an error for
     each fault. With `on_error="warn"`, a fault is logged once and listed in the
@@ -111,19 +111,19 @@ class MonitoredRun:
     Attributes:
         env: the recorded environment.
         options: the user's options.
-        choice: decides what to record of an episode when it begins.
+        choice: decides what to record when an episode begins.
         stats: the recorder that counts steps and rewards.
         finisher: the finisher that processes ended recordings.
         selection: facts for videos that are chosen after their episodes have ended;
-            empty if videos are chosen before.
+            empty if videos are chosen when episodes begin.
         directory: the monitor directory, absolute.
         infix: the middle part of the monitor's file names.
-        clock: function that returns the time in seconds since the Unix epoch.
+        clock: a function that returns the time in seconds since the Unix epoch.
         events: the journal's content so far, including events that could not be written
             because the disk was full.
         trackers: the trackers, which are notified of episodes and finished videos.
-        of_episodes: the states of episodes.
-        of_clips: the states of clips.
+        of_episodes: the track for episodes.
+        of_clips: the track for clips.
         no_video: a disabled recorder for episodes without a video.
     """
 
@@ -272,7 +272,7 @@ class MonitoredRun:
         return is_warned
 
     def ask(self, what: What, choose: Callable[..., Any], *about: Any) -> bool:
-        """Return the choice of a user's function, which may raise anything.
+        """Return the decision of a user's function, which may raise any exception.
 
         Args:
             what: the part of the recording that is lost if the function raises.
@@ -280,7 +280,7 @@ class MonitoredRun:
             *about: the function's arguments.
 
         Returns:
-            The choice; False if the function raised and `on_error` tolerates that.
+            The decision; False if the function raised and `on_error` tolerates that.
         """
         try:
             return bool(choose(*about))
@@ -375,13 +375,13 @@ class MonitoredRun:
         return self._episode
 
     def begin(self, episode: RunningEpisode) -> None:
-        """Begin an episode. From now on, faults are attributed to it."""
+        """Begin an episode. Subsequent faults are attributed to this episode."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)
         self._note_stated_faults()
 
     def caption(self) -> Caption:
-        """Return the caption of the current frame."""
+        """Return the caption for the current frame."""
         began, now = self.episode.reset_clock, self.env.clock()
         return Caption(
             episode_id=self.episode.episode_id,
@@ -412,12 +412,12 @@ class MonitoredRun:
     def pending_video(
         self, name: str, recording: str, *, is_only_possible: bool = False
     ) -> dict[str, Any]:
-        """Return the facts about a video that its trajectory or clip stores.
+        """Return the facts about a video to store in its trajectory or clip.
 
         Args:
             name: the video's file name without the extension.
             recording: when the video is drawn, `DEFERRED` or `LIVE`.
-            is_only_possible: whether the video is not planned.
+            is_only_possible: whether the video is merely possible, not planned.
         """
         options, env = self.options, self.env
         pending: dict[str, Any] = {
@@ -438,7 +438,7 @@ class MonitoredRun:
         return pending if is_only_possible else {**pending, **self.second_name(name)}
 
     def second_name(self, name: str) -> dict[str, str]:
-        """Return the second name of a video for its metadata.
+        """Return the second name of a video, for its metadata.
 
         The result is empty if `name_prefix` is not set.
 
@@ -455,7 +455,7 @@ class MonitoredRun:
         return {"also_named": f"{prefix}-{what}-{number}.mp4"}
 
     def recording_facts(self, start: EpisodeStart | None) -> dict[str, Any]:
-        """Return the facts about the running episode for a recording of states.
+        """Return the facts about the running episode, for a recording of states.
 
         Args:
             start: the start of the states; None if no states are recorded.
@@ -474,7 +474,7 @@ class MonitoredRun:
         }
 
     def live_facts(self) -> dict[str, Any]:
-        """Return the facts about the running episode for a live video's metadata."""
+        """Return the facts about the running episode, for a live video's metadata."""
         known = self.recording_facts(None)
         video: dict[str, Any] = {"reason": self.env.rendering.reason}
         if self.selection:

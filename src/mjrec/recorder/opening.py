@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a monitor directory, which may be new, resumed, or cleared by force.
+"""Functions that open a monitor directory, which may be new, resumed, or cleared.
 
 Opening claims an infix, which then identifies one monitor. The claim is a lock file
 that is created with `O_EXCL` and held with `flock` while the monitor is open. A lock
@@ -43,16 +43,16 @@ def open_directory(
 
     With `resume`, episode numbers continue after the highest number of all closed or
     dead monitors, or only of those with the same `uid` if it is given. Monitors that
-    are still open do not count. `JOIN` reads no files of other monitors, no matter how
-    many there are. In this case the caller knows that all monitors record the same
+    are still open do not count. With `JOIN`, the files of other monitors are not read,
+    however many there are. The caller then guarantees that all monitors record the same
     environment, and episodes are numbered from 0. `force` overrides `resume`.
 
     Args:
         path: absolute path of the monitor directory.
         options: the user's options.
         facts: the facts about the run, including its `env_info`. They are written to
-            the lock file, so they survive even if the process is killed before the
-            journal has a line.
+            the lock file, so they survive even if the process is killed before it
+            writes to the journal.
 
     Returns:
         The claimed infix, its lock, which is held until the monitor closes, and the
@@ -124,7 +124,7 @@ def _check_existing(path: Path, options: RecorderOptions, *, env_id: str) -> Non
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
-    """Return the episode number after the highest number of all closed monitors."""
+    """Return the number after the highest episode number of all closed monitors."""
     highest = -1
     for files in monitors_of(path):
         if uid is not None and files.infix.partition(".")[2] != uid:
@@ -158,11 +158,11 @@ def _claim(
     Args:
         path: the directory.
         uid: string to use in the infix instead of the process id. The infix's number
-            then depends on the directory, so that names are the same in any process.
+            then depends on the directory, so that names are the same in every process.
         run: the run's facts.
-        looks: whether to look for any file with the infix. Otherwise, only a manifest,
-            a journal or a lock shows that the infix is taken. Each monitor leaves at
-            least one of these files.
+        looks: whether to look for any file with the infix. Otherwise, only manifests,
+            journals and locks are considered. Each monitor leaves at least one of these
+            files.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
@@ -187,8 +187,8 @@ def _claim(
 def _is_taken(
     path: Path, infix: str, *, looks: bool, besides: str | None = None
 ) -> bool:
-    # A pid or uid is rarely used twice. Every monitor that closed has left a manifest,
-    # so usually there is no need to list the whole directory.
+    # A pid or uid is rarely used twice. Every closed monitor has left a manifest, so
+    # there is usually no need to list the whole directory.
     if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
         return True
     return looks and any(

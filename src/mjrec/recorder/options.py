@@ -37,7 +37,7 @@ _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 @dataclass(frozen=True, kw_only=True)
 class Statements:
-    """Facts of an original run that a recreation cannot reproduce and must copy.
+    """Facts about an original run that a recreation cannot reproduce and must copy.
 
     Attributes:
         infix: the middle part of the run's file names, which is not claimed yet.
@@ -45,9 +45,9 @@ class Statements:
         provenance: the run's provenance; None if unknown.
         provenance_after: number of journal lines before the provenance, not counting
             the first line.
-        clock: function that returns the time in seconds since the Unix epoch.
-        faults: the facts of each fault, paired with the number of journal lines before
-            it.
+        clock: a function that returns the time in seconds since the Unix epoch.
+        faults: the facts about each fault, paired with the number of journal lines
+            before it.
     """
 
     infix: str
@@ -60,7 +60,7 @@ class Statements:
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderOptions:
-    """A monitor's options, which `mjrec.Monitor` describes.
+    """A monitor's options, which are described in `mjrec.Monitor`.
 
     Raises:
         InvalidArgument: a value is invalid.
@@ -91,7 +91,7 @@ class RecorderOptions:
     tiled: bool = False
     trackers: Tracker | Sequence[Tracker] = ()
     policy_file: str | os.PathLike[str] | None = None
-    # Size of a row log's tail in bytes. Vector environments share a budget.
+    # Size of a row log's tail in bytes. Vector environments share one budget.
     tail_bytes: int = TAIL_BYTES
     # The seed from which the episodes' seeds are derived, if any.
     seed: int | None = None
@@ -155,7 +155,7 @@ class RecorderOptions:
             if self.video_callable is not None:
                 raise InvalidArgument(
                     "step_trigger chooses videos by step, and video_callable chooses "
-                    "them by episode. Give only one of them."
+                    "them by episode. Pass only one of them."
                 )
         length = self.video_length
         if length is not None and (not _is_whole(length) or length < 1):
@@ -185,12 +185,12 @@ class RecorderOptions:
         if self.video_callable is not None:
             raise InvalidArgument(
                 "keep chooses episodes after they have ended, and video_callable "
-                "before they begin. Give only one of them."
+                "before they begin. Pass only one of them."
             )
         if self.has_clips:
             raise InvalidArgument(
                 "keep chooses videos of whole episodes, but step_trigger and "
-                "video_length record clips, counted in steps. Give only one of them."
+                "video_length record clips, counted in steps. Pass only one of them."
             )
         if self.render == OFF:
             raise InvalidArgument(
@@ -210,7 +210,7 @@ class RecorderOptions:
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
                 f"The same tracker appears twice in {given!r} and would get every call "
-                "twice. Give each tracker once."
+                "twice. Pass each tracker only once."
             )
 
     def _check_policy_file(self) -> None:
@@ -252,7 +252,7 @@ class RecorderOptions:
 
     @property
     def has_clips(self) -> bool:
-        """Whether videos are clips with a number of steps instead of whole episodes."""
+        """Whether videos are clips, counted in steps, instead of whole episodes."""
         return self.step_trigger is not None or self.video_length is not None
 
     @property
@@ -280,7 +280,7 @@ class RenderingChoice:
 
 
 def type_of_mode(mode: str | None) -> str:
-    """Return the episode type of a monitor mode: "t" or "e".
+    """Return the episode type for a monitor mode: "t" or "e".
 
     Raises:
         InvalidArgument: the mode does not exist.

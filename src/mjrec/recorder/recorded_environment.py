@@ -33,23 +33,22 @@ class RecordedEnvironment:
             single environment.
         frames: the source of live frames.
         further_frames: sources of live frames from additional cameras, keyed by the
-            endings of the videos' names.
-        clock: function that returns the simulated time in seconds, or None.
-        declared: function that returns the frame rate to use if there is no simulated
+            endings of the video names.
+        clock: a function that returns the simulated time in seconds, or None.
+        declared: a function that returns the frame rate to use if there is no simulated
             time.
         rendering: the choice of when frames are drawn.
         cameras: all cameras as JSON values, if there are several cameras.
-        states: the capture of the simulation's states; None if no simulation is
-            accessible.
+        states: captures the simulation's states; None if no simulation is accessible.
         clip_states: a second capture of the same states for clips; None without clips.
-            It is needed because clips overlap with episodes, and a capture can have
-            only one reader.
-        environment: the facts needed to recreate the environment, which trajectories
-            store.
+            It is needed because clips overlap with episodes and a capture can have only
+            one reader.
+        environment: the facts needed to recreate the environment, which are stored in
+            trajectories.
         view: the requested cameras and sizes, and the environment's own view, as JSON
             values. Defaults are left out.
-        random_state: function that returns the state of the environment's random
-            generator as JSON values, or None.
+        random_state: a function that returns the state of the environment's random
+            number generator as JSON values, or None.
     """
 
     env_id: str
@@ -78,7 +77,7 @@ def check_frames(env: RecordedEnvironment) -> None:
     why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
         f"Videos were requested, but {env.env_id} provides no frames{why}: "
-        f"{_what_is_missing(env)}, or record statistics only with "
+        f"{_what_is_missing(env)}, or record only statistics with "
         "video_callable=False."
     )
 

@@ -39,11 +39,12 @@ UNKNOWN_ACTION: Final = object()
 class Recorder:
     """Drives the statistics, journal, trajectories, videos and manifest of one monitor.
 
-    It is notified of an environment's calls and does not call the environment, except
+    It is notified of calls to an environment and does not call the environment, except
     for frames and states. For a reset, call `before_reset`, reset the environment
     inside `resetting`, and call `reset`. For a step, call `before_step`, step the
-    environment, and call `step`; while there is a `fast` path, call its functions
-    instead. At the end, call `close`. A recorder belongs to its creating process.
+    environment, and call `step`. While there is a `fast` path, call its functions
+    instead. At the end, call `close`. A recorder belongs to the process that created
+    it.
 
     Args:
         directory: the monitor directory.
@@ -61,9 +62,8 @@ class Recorder:
         stats_recorder: counts steps and rewards.
         closed: whether recording has ended.
         fast: the fast path for the next step; None if the step needs the full path.
-        evaluation_facts: a function that returns, for the journal line of an episode
-            that has ended, the facts about the evaluation it belongs to; None if it
-            belongs to none.
+        evaluation_facts: a function that returns the facts about the evaluation that an
+            ended episode belongs to, for its journal line; None if it belongs to none.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Recorder:
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
-        # Why the running episode ends early, set when the environment raises.
+        # Why the running episode ends early. Set when the environment raises.
         self._ending: dict[str, Any] | None = None
         self._recording: EpisodeRecording | None = None
         self.closed = False
@@ -162,11 +162,11 @@ class Recorder:
     def reset(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
     ) -> None:
-        """Begin an episode; the environment has just been reset.
+        """Begin an episode after the environment has just been reset.
 
-        A reset before the running episode's first step keeps the episode's number and
-        replaces its frame. A reset during an episode ends that episode's video, which
-        is marked as incomplete.
+        A reset before the running episode's first step keeps the episode's number but
+        replaces its frame. A reset in mid-episode ends that episode's video, which is
+        marked as incomplete.
 
         Args:
             seed: the seed given to the environment's reset.
@@ -214,11 +214,11 @@ class Recorder:
                 self._write_results()
 
     def note_error(self, error: BaseException) -> None:
-        """Note an exception raised by the environment's step or reset, or by its user.
+        """Note an exception raised by the environment's step or reset or by the caller.
 
         The running episode, if any, is marked with the error, unless a later step
         succeeds. A reset is always allowed afterwards. The environment's state is no
-        longer recorded, because it may be in the middle of a step.
+        longer recorded, because the error may have occurred in mid-step.
         """
         self.fast = None
         if self.stats_recorder.done is False and self._ending is None:
@@ -256,7 +256,7 @@ class Recorder:
         """Record a step that the environment has just taken.
 
         Args:
-            reward: a number or an array of one element.
+            reward: a number, or an array with one element.
             terminated: whether the task ended the episode.
             truncated: whether a limit outside the task ended it.
             frame: False if the environment has already reset itself, so that its frame
@@ -275,7 +275,7 @@ class Recorder:
         failures = Failures()
         is_counted = False
         try:
-            # The row comes first, so that a counted step has a row if it can have one.
+            # Record the row first, so that a counted step has a row whenever possible.
             if fast is not None and frame:
                 is_counted = fast.step(reward, **flags)
             if states is not None and not is_counted:
@@ -289,7 +289,7 @@ class Recorder:
         except Error as error:
             failures.note(error)
         except BaseException as error:
-            # A signal handler has raised, so this step is not recorded.
+            # A signal handler has raised an exception, so this step is not recorded.
             self.note_error(error)
             raise
         if is_counted:
@@ -314,7 +314,7 @@ class Recorder:
         """End the running episode, and wait until all videos are rendered.
 
         Without background rendering, this writes the trajectories in their final form.
-        Call it before `close`, which does not wait.
+        Call this method before `close`, which does not wait.
 
         Args:
             on_progress: called with the progress while waiting.
@@ -333,13 +333,13 @@ class Recorder:
     def close(self) -> None:
         """End the episode, write the statistics and manifest, and close. Idempotent.
 
-        Rendering stops; videos that are not rendered yet stay pending. An unfinished
-        episode is left out of the statistics; its video is kept and marked as
-        incomplete. If `close` is interrupted (Ctrl-C), the recorder is closed anyway:
-        the files stay as SIGKILL would leave them, and recovery completes them.
+        Rendering stops, and videos that are not rendered yet stay pending. An
+        unfinished episode is left out of the statistics. Its video is kept and marked
+        as incomplete. If `close` is interrupted (Ctrl-C), the recorder is closed
+        anyway: the files stay as SIGKILL would leave them, and recovery completes them.
 
         Raises:
-            EncoderError: the video could not be finished; the rest is written.
+            EncoderError: the video could not be finished. Everything else is written.
             FileNotWritten: the disk is full; the next call tries again.
         """
         if self.closed:
@@ -375,7 +375,7 @@ class Recorder:
             )
 
     def _is_unbegun(self) -> bool:
-        """Return whether the running episode has had no step yet."""
+        """Return whether the running episode has no steps yet."""
         stats = self.stats_recorder
         return stats.done is False and stats.steps == 0 and self._ending is None
 
@@ -386,7 +386,7 @@ class Recorder:
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
         self.run.events.begin(number, chosen=wanted and self._kept is None)
-        # With clips the episode has no video of its own.
+        # With clips, the episode has no video of its own.
         recording.begin(observation, wants_video=wanted and self._clips is None)
 
     def _take_last_frame(self) -> None:
@@ -399,14 +399,14 @@ class Recorder:
     def _take_frames(
         self, failures: Failures, reward: float, flags: Mapping[str, bool], frame: bool
     ) -> None:
-        """Take a step's live frames, and the clip's frame."""
+        """Take the live frames of a step, and the frame for a clip."""
         live = None if self._recording is None else self._recording.live
         if live is not None:
             with failures:
                 try:
                     live.take(last=any(flags.values()), is_there=frame)
                 except Exception as error:
-                    # It may come from the environment itself.
+                    # The error may come from the environment itself.
                     self.note_error(error)
                     raise
         if self._clips is not None:
@@ -423,8 +423,8 @@ class Recorder:
         if recording is None or recording.is_over:
             return
         if self.stats_recorder.done:
-            # A signal arrived between its last step and its end. Its rows say that it
-            # is complete, and recovery ends it.
+            # A signal arrived between the episode's last step and its end. The rows
+            # show that it is complete, so recovery will finish it.
             recording.is_over = True
             self._leave_recording(recording)
             return
@@ -434,10 +434,10 @@ class Recorder:
         failures.raise_first()
 
     def _leave_recording(self, recording: EpisodeRecording) -> None:
-        """Leave the running episode as SIGKILL would."""
+        """Leave the running episode in the state in which SIGKILL would leave it."""
         recording.leave()
-        # The span may now reach to the log's last row, so the next episode needs a
-        # new log.
+        # The span may now extend to the log's last row, so the next episode needs a new
+        # log.
         self.run.of_episodes.logs.release()
 
     def _end_episode(
@@ -454,7 +454,7 @@ class Recorder:
             facts: the facts about the episode's end.
             failures: collects the errors raised here.
             success: whether the environment reports success; None if unknown.
-            take: takes the episode's last frames.
+            take: a function that takes the episode's last frames.
         """
         recording, is_complete = self._recording, facts["complete"]
         assert recording is not None, "there was no reset"
@@ -473,13 +473,13 @@ class Recorder:
             standing = kept.selection.standing(episode_id)
         is_dropped = standing is Standing.DROPPED
         is_chosen = recording.is_chosen and standing is Standing.CHOSEN
-        # Only once, even if this is interrupted: recovery completes the rest.
+        # Do this only once, even if interrupted; recovery completes the rest.
         recording.is_over = True
         try:
-            # After a kill, an episode without its model would be useless.
+            # If the process is killed, an episode without its model will be useless.
             for states in self._states:
                 states.settle()
-            # Before any drawing, so that a failing video cannot lose the episode.
+            # Write this before drawing, so that no failing video loses the episode.
             with failures:
                 choice: dict[str, Any] = {
                     "chosen": is_chosen,
@@ -581,7 +581,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def _leaving_if_interrupted(self) -> Iterator[None]:
-        """Release all files if the block is interrupted; errors propagate."""
+        """Release all files if the block is interrupted, but not after an error."""
         try:
             yield
         except Exception:
@@ -596,7 +596,7 @@ class Recorder:
             raise
 
     def _leave(self) -> None:
-        """Release all files as they are, as the end of this process would."""
+        """Release all files as they are, as if this process had ended."""
         self.closed = self.stats_recorder.closed = True
         self.run.finisher.stop()
         for each in (self._recording, self._clips):

@@ -2,10 +2,10 @@
 """The recording of one episode, with or without states and videos.
 
 If videos are chosen after their episodes have ended, every episode is recorded as if it
-got a video. The recordings for which no decision has been made are held, and the log
-marks each of them as a candidate. While the monitor is open, other processes leave
-candidates alone. After that, any process may render them. Dropped recordings are
-deleted immediately.
+were to get a video. Recordings are held until a decision is made, and the log marks
+each of them as a candidate. While the monitor is open, other processes leave candidates
+alone. After that, any process may render them. Dropped recordings are deleted
+immediately.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class EpisodeRecording:
             self.live.take_last()
 
     def discard(self) -> None:
-        """Discard everything that was recorded of the episode."""
+        """Discard everything that was recorded about the episode."""
         if self.live is not None:
             self.live.discard()
             self.live = None
@@ -148,8 +148,8 @@ class EpisodeRecording:
                 own = {"length": self.states.steps, "end_time": end_time}
                 early = self.states.early_end
                 if early is not None and self.states.steps < (stats.steps or 0):
-                    # Its trajectory ends before the episode. Readers add up the rewards
-                    # of the rows that are there.
+                    # The trajectory ends before the episode. Readers add up the rewards
+                    # of the rows that exist.
                     cut = {"complete": False, **early, "reward": None}
                     self.states.end({**cut, **own})
                 else:
@@ -159,7 +159,7 @@ class EpisodeRecording:
                 self.live.end(known)
 
     def hand_on(self) -> None:
-        """Submit the recording to the finisher, and announce videos to the trackers."""
+        """Submit the recording to the finisher, and its videos to the trackers."""
         self.expect()
         self._submit()
 
@@ -210,7 +210,7 @@ class EpisodeRecording:
             self.states.drop()
 
     def _submit(self) -> None:
-        # Without a span the disk was too full for a single row: no video will come.
+        # Without a span, the disk was too full for a single row, so there is no video.
         if self.states is not None and self.states.is_there:
             self._run.submit(self._path)
 
@@ -244,7 +244,7 @@ class EpisodeRecording:
 
 
 class KeptVideos:
-    """Holds, submits or deletes recordings as a selection decides.
+    """Holds, submits or deletes recordings, as decided by a selection.
 
     Args:
         selection: the object that chooses the episodes that get a video.
@@ -257,7 +257,7 @@ class KeptVideos:
         self.selection = selection
         self.held: dict[int, EpisodeRecording] = {}
         self._is_decided = False
-        # The reason why no decision could be made, and the episodes kept because of it.
+        # The reason why no decision could be made, and the episodes kept as a result.
         self._failure: str | None = None
         self._left: list[int] = []
 

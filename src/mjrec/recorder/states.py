@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording the states of an episode, or of one part of a clip, one row per step."""
+"""A recorder for the states of an episode or of part of a clip, one row per step."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ logger = logging.getLogger(__name__)
 class StateRecorder:
     """Records the states of an episode, or of a part of one, one row per step.
 
-    The first row is the reset's. It waits in memory until the first step shows what an
-    action looks like and how long a step takes. Frames are taken at steps 0, n, 2n ...,
-    where n is the smallest stride that respects `max_fps`, and always at the last step.
+    The first row is for the reset. It stays in memory until the first step shows what
+    an action looks like and how long a step takes. Frames are taken at steps 0, n, 2n
+    ..., where n is the smallest stride that respects `max_fps`, and at the last step.
 
     Errors are handled here. If no more frames can be taken, only the states are
-    recorded from then on. If nothing can be written any more, the recording ends there;
-    this raises an error unless `on_error` lets the simulation continue.
+    recorded from then on. If nothing can be written anymore, the recording ends there,
+    and an error is raised unless `on_error` lets the simulation continue.
 
     Args:
         run: the monitored run.
         name: name of the resulting file, without suffix.
         facts: the facts known at the beginning, in addition to the run's.
-        start: the value that `begin_episode` of the capture returned; None if no states
+        start: the value returned by the capture's `begin_episode`; None if no states
             are accessible.
         observation: the reset's observation; None if observations are not recorded.
-        is_clip: whether it is a part of a clip. Its frames do not depend on actions, so
-            these are left out. The frames of all parts are counted together, so
-            `max_fps` selects them when they are drawn.
-        is_alone: whether it may be deleted separately; it then gets its own log.
+        is_clip: whether this is a part of a clip. A clip's frames do not depend on
+            actions, so actions are left out. The frames of all parts are counted
+            together, so `max_fps` selects them when they are drawn.
+        is_alone: whether it gets its own log, so that it can be deleted separately.
 
     Attributes:
         early_end: the facts about the error that stopped the recording; None while the
@@ -87,7 +87,7 @@ class StateRecorder:
         self._irregular: set[str] = set()
         # Pairs of a step and the dtype of the actions from that step on.
         self._action_dtypes: list[list[Any]] = []
-        # The parts of the reset's row.
+        # The parts of the row for the reset.
         self._first: dict[str, Any] = {"action": 0}
         self._first_change: Mapping[str, NDArray[Any]] | None = None
         self._observation = None if observation is None else step_array(observation)
@@ -169,8 +169,8 @@ class StateRecorder:
                 state belongs to the next episode.
 
         Raises:
-            FileNotWritten: the disk is full, and `on_error` does not tolerate that.
-                The step was not recorded; everything before it is kept.
+            FileNotWritten: the disk is full, and `on_error` does not tolerate that. The
+                step was not recorded, but everything before it is kept.
         """
 
         def take_row() -> None:
@@ -184,7 +184,7 @@ class StateRecorder:
                 if has_frame and (is_last or number % self._stride == 0):
                     is_frame = self._write_snapshot(span, slot, number)
             finally:
-                # Even after an exception: a reader stops at the first missing step.
+                # Do this even after an exception: readers stop at the first gap.
                 columns = span.log.columns
                 if self._action is not None:
                     columns["action"][slot] = self._action.values
@@ -237,7 +237,7 @@ class StateRecorder:
         )
 
     def note(self, **facts: Any) -> None:
-        """Add facts. If the disk is full, they are written with the next ones."""
+        """Add facts. If the disk is full, they are written along with later facts."""
         self._facts = {**self._facts, **facts}
         with contextlib.suppress(FileNotWritten):
             self.amend(facts)
@@ -281,7 +281,7 @@ class StateRecorder:
             self._span.drop()
 
     def _take_back(self) -> None:
-        """Discard the reset's row; the first step will write it again."""
+        """Discard the row for the reset. The first step will write it again."""
         self._fast = None
         if self._span is not None:
             # A full disk is reported by a later write.
@@ -325,7 +325,7 @@ class StateRecorder:
         )
 
     def _settled(self) -> SpanWriter:
-        """Return the span for the next row, begun or corrected at the first step."""
+        """Return the span for the next row. The first step begins or corrects it."""
         if self._span is not None and self.steps:
             return self._span
         pace = self._measured_pace(self._run.env.clock())
@@ -343,7 +343,7 @@ class StateRecorder:
         return 1 if self._pace is None else int(self._pace["stride"])
 
     def _begin(self, pace: Mapping[str, Any]) -> None:
-        """Begin the span and write the reset's row."""
+        """Begin the span and write the row for the reset."""
         action, start = self._action, self._start
         self._track.pace, self._track.action = pace, action
         self._pace = pace
@@ -403,7 +403,7 @@ class StateRecorder:
         return self._takes_frames
 
     def _parts(self) -> dict[str, Any]:
-        """Return names and shapes of the arrays that were joined into one vector."""
+        """Return the names and shapes of the arrays that were joined into a vector."""
         arrays = {"action": self._action, "observation": self._observation}
         return {
             f"{name}_parts": [
@@ -460,7 +460,7 @@ def _pace(
     }
 
 
-# Cached because comparing dtypes is slow unless they are the same object.
+# Cached because dtypes are slow to compare unless they are the same object.
 _row_dtype = functools.lru_cache(maxsize=16)(row_dtype)
 
 # Cached because NumPy builds the name on each access.
@@ -475,10 +475,10 @@ def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, 
 
 
 class DeferredVideo:
-    """A video that is rendered later; it takes the place of a `VideoRecorder`.
+    """A video that is rendered later, in place of a `VideoRecorder`.
 
-    Its frames are recorded snapshots. Its files are written when the video is rendered,
-    which the monitor's `close` waits for.
+    Its frames are recorded snapshots. Its files are written when the video is rendered.
+    The monitor's `close` waits for that.
 
     Args:
         directory: the video's directory.
@@ -501,7 +501,7 @@ class DeferredVideo:
 
     @property
     def broken(self) -> bool:
-        """Whether frame recording ended early; earlier frames are still rendered."""
+        """Whether frame recording ended early. Earlier frames are still rendered."""
         return self._states.broken_reason is not None
 
     @property

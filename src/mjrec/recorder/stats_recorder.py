@@ -30,8 +30,8 @@ class StatsRecorder:
         file_prefix: prefix of the file name, `<file_prefix>.stats.json`.
         autoreset: whether the step that ends an episode also starts a new episode.
         env_id: the environment's name, for messages.
-        allow_early_reset: whether a reset in the middle of an episode drops the episode
-            instead of raising `ResetNotAllowed`.
+        allow_early_reset: whether a reset in mid-episode drops the episode instead of
+            raising `ResetNotAllowed`.
 
     Attributes:
         initial_reset_timestamp: time just before the first reset, in seconds since the
@@ -215,7 +215,7 @@ class StatsRecorder:
 
     def _check_open(self) -> None:
         if self.closed:
-            raise ClosedError(f"The statistics recorder of {self.path} is closed.")
+            raise ClosedError(f"The statistics recorder for {self.path} is closed.")
 
 
 def reward_to_float(reward: Any) -> float:

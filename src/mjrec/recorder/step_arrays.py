@@ -13,8 +13,8 @@ from ..simulation.raw_memory import words_of
 
 _ARRAY = np.ndarray
 
-# Dtypes that can store every value of a kind exactly. They are needed because users may
-# pass float32 in one step and float64 in the next.
+# Dtypes that can store every value of one kind exactly. They are needed because users
+# may pass float32 in one step and float64 in the next.
 _WIDEST = {"f": np.dtype("<f8"), "i": np.dtype("<i8"), "b": np.dtype("<i8")}
 
 
@@ -24,13 +24,13 @@ class StepArray:
     Attributes:
         kind: dtype and shape of the array, as a subarray dtype.
         values: the array that was set last. It always uses the same memory.
-        words: where this memory is (see `raw_memory.WORDS`); None if the array does not
-            fill whole words.
+        words: the location of this memory (see `raw_memory.WORDS`); None if the array
+            does not fill whole words.
         parts: names and shapes of the arrays in a dictionary, which are stored one
             after another; None for a plain array.
         given: the original dtype of the array that was set last; None before the first
             array, and for dictionaries.
-        on_other_dtype: function that is called when `given` has changed.
+        on_other_dtype: a function that is called when `given` has changed.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class StepArray:
 def step_array(example: Any) -> StepArray | None:
     """Return a buffer for arrays like `example`, or None if it is not an array.
 
-    Floats are stored as float64. Signed integers and bools are stored as int64. Thus
-    every value is stored exactly. Unsigned integers (such as frames) keep their dtype.
-    A dictionary of arrays becomes a single float64 vector.
+    Floats are stored as float64. Signed integers and bools are stored as int64. Every
+    value is therefore stored exactly. Unsigned integers (such as frames) keep their
+    dtype. A dictionary of arrays becomes a single float64 vector.
     """
     if isinstance(example, Mapping):
         return _of_mapping(example)
@@ -115,9 +115,9 @@ def step_array(example: Any) -> StepArray | None:
 def action_array(example: Any) -> StepArray | None:
     """Return a buffer for actions like `example`, or None if it is not an array.
 
-    The buffer is the same as from `step_array`, except that arrays of signed integers
-    become float64. The reason is that `[0.5, 0.1]` may follow `[0, 0]`. A single
-    integer is a discrete action and remains an integer.
+    The buffer is like that from `step_array`, except that arrays of signed integers
+    become float64. This is because `[0.5, 0.1]` may follow `[0, 0]`. A single integer
+    is a discrete action and remains an integer.
     """
     if isinstance(example, list | tuple | np.ndarray):
         array = step_array(example)

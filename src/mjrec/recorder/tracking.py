@@ -83,7 +83,7 @@ class FinishedVideo:
         episode_id: number of the episode that the video shows, or in which it starts.
         view: the name of an additional camera, or `tiled`, as in the file name; empty
             for the first camera.
-        episode: the episode; None if it is not over or was not completed.
+        episode: the episode; None if the episode has not ended or was not completed.
     """
 
     path: Path
@@ -96,11 +96,11 @@ class FinishedVideo:
 class Tracker:
     """Base class for experiment trackers, for `mjrec.Monitor(..., trackers=...)`.
 
-    Override the methods in a subclass. By default they do nothing. A tracker can serve
-    several runs at the same time, such as the runs of a vector environment. Each call
-    therefore includes the run. If a method raises an exception, the error is logged and
-    recorded in the manifest. The tracker then gets no more calls for that run, and the
-    recording continues.
+    Override the methods in a subclass. By default, the methods do nothing. A tracker
+    can serve several runs at the same time, such as the runs of a vector environment.
+    Each call therefore includes the run. If a method raises an exception, the error is
+    logged and recorded in the manifest. The tracker is then not called again for that
+    run, and the recording continues.
     """
 
     def begin(self, run: Run) -> None:
@@ -117,19 +117,19 @@ class Tracker:
         """
 
     def end(self, run: Run) -> None:
-        """Called at the end of a run. No other call for the run follows."""
+        """Called at the end of a run, as the last call for the run."""
 
 
 class Trackers:
     """The trackers of one run.
 
     A tracker that raises an exception is not called again. For example, a tracker that
-    has lost its server does not stop the simulation.
+    loses its server does not stop the simulation.
 
     Args:
         run: the run to report to the trackers.
         trackers: the trackers.
-        on_fault: function that is called when a tracker has raised an exception. Its
+        on_fault: a function that is called when a tracker has raised an exception. Its
             arguments are the tracker's class name, the error, and the number of the
             reported episode or None.
     """
@@ -173,7 +173,7 @@ class Trackers:
             self._report_videos()
 
     def end(self) -> None:
-        """Report the end of the run. After that, no tracker is called again."""
+        """Report the end of the run. No tracker is called afterwards."""
         self._report_videos()
         self._notify(None, "end")
         self._trackers = ()

@@ -30,7 +30,7 @@ _TEXT_MODES = ("ansi", "ansi_list")
 
 
 class FrameSource(Protocol):
-    """A source of frames, such as an environment or an object that replaces it."""
+    """A source of frames, such as an environment or a stand-in for one."""
 
     @property
     def render_mode(self) -> str | None:
@@ -59,7 +59,7 @@ class VideoRecorder:
     unfinished mp4 for `mjrec.recover`.
 
     A bad frame (None, or a different size or type from the first frame) ends the video.
-    The earlier frames remain as a playable file, `broken` is set, and a warning and the
+    The earlier frames remain as a playable file, and `broken` is set. A warning and the
     metadata report the bad frame.
 
     Args:
@@ -69,20 +69,20 @@ class VideoRecorder:
             `path` and `base_path`, a file in a new temporary directory is used.
         metadata: initial entries for the metadata file. The mapping is copied.
         enabled: whether to record. If false, the recorder does nothing.
-        base_path: path without the extension, instead of `path`.
-        fps: frame rate of the file, instead of real time.
+        base_path: path without the extension, as an alternative to `path`.
+        fps: frame rate of the file, if the video should not play in real time.
         max_fps: maximum frame rate. In the `rgb_array` mode, every n-th frame and the
             last frame are taken (see `capture_last`). Other render modes keep all
             frames.
         frame_hashes: whether to write a `.framehash` file next to a video of images.
-        clock: function that returns the simulated time in seconds, or None if there is
-            no simulated time.
-        declared: function that returns the rate to use without simulated time.
-        facts: function that returns additional metadata. It is called once there is a
+        clock: a function that returns the simulated time in seconds, or None if there
+            is no simulated time.
+        declared: a function that returns the rate to use if no time is simulated.
+        facts: a function that returns additional metadata. It is called once there is a
             frame.
         strict: whether `close` raises an error if the images show nothing (all black, a
-            single colour or no movement). Otherwise it logs a warning.
-        caption: function that returns the text to write on the current frame, or None.
+            single color or no movement). Otherwise, it logs a warning.
+        caption: a function that returns the text for the current frame, or None.
 
     Raises:
         MissingDependency: captions were requested, but Pillow is not installed.
@@ -95,7 +95,7 @@ class VideoRecorder:
         metadata: the content of the metadata file so far.
         enabled: whether the recorder records frames.
         broken: whether a bad frame or a failed encoder ended the video early.
-        finished: whether the video exists and is complete. Only known after `close`.
+        finished: whether the video exists and is complete. Known only after `close`.
         closed: whether `close`, `leave` or `discard` was called.
     """
 
@@ -170,7 +170,7 @@ class VideoRecorder:
 
     @property
     def empty(self) -> bool:
-        """Whether there are no frames, even if the encoder has lost captured frames."""
+        """Whether there are no frames, or the encoder has lost all captured frames."""
         return self._steps.total == 0
 
     @property
@@ -221,7 +221,7 @@ class VideoRecorder:
         )
 
     def break_off(self, reason: str, *, frames: int) -> None:
-        """Stop after the given number of frames. If it is 0, delete all frames."""
+        """Stop after the given number of frames. With 0, delete all frames."""
         if frames:
             self._breaks_off = frames, reason
         else:
@@ -284,7 +284,7 @@ class VideoRecorder:
         extension = ".json" if self.ansi_mode else ".mp4"
         if path is not None and base_path is not None:
             raise InvalidArgument(
-                f"Give either path ({path}) or base_path ({base_path}), not both."
+                f"Pass either path ({path}) or base_path ({base_path}), not both."
             )
         if base_path is not None:
             return os.fspath(base_path) + extension
@@ -330,7 +330,7 @@ class VideoRecorder:
             self._waiting.append((taken, caption))
 
     def _settle_rate(self, step: int, frames: int) -> None:
-        """Open the video once the frames of two steps show the duration of a step."""
+        """Open the video once the frames of two steps show how long a step takes."""
         if self._sink is not None or self._first is None:
             return
         (first, start), now = self._first, self._clock()
@@ -426,7 +426,7 @@ def declared_rate(env: object) -> Fraction:
     """Return the frame rate that an environment declares.
 
     The rate follows from the control timestep of a dm_control environment or from `dt`
-    of a Gymnasium MuJoCo environment. For other environments it is `render_fps` in the
+    of a Gymnasium MuJoCo environment. For other environments, it is `render_fps` in the
     metadata. The default is 30, with a warning if the environment can be drawn.
 
     Raises:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing recordings while a simulation runs, in a separate process.
+"""A separate process that finishes recordings while a simulation runs.
 
-`Background` lives in the simulation's process and does next to nothing there: it adds
-no thread, no simulator and no OpenGL. It starts the process that does the work,
-`python -m mjrec.rendering.background OPTIONS` (a JSON object), and sends it::
+`Background` runs in the simulation's process, without a thread, a simulator or OpenGL.
+It starts the process that does the work, `python -m mjrec.rendering.background OPTIONS`
+(a JSON object), and sends it::
 
     {"expected": "<name>"|null}     a video will have to be rendered; the name is that
-                                    of the recording that begins now, if there is one
+                                    of a recording that begins now, if any
     {"recording": "<name>"}         an ended trajectory, or the first part of a clip
     {"waited_for": true}            nothing more will come for now
 
@@ -16,8 +16,8 @@ The process sends::
     {"done": "<recording>", "failures": {"<video or trajectory>": "..."}}
     {"log": ["mjrec.x", 30, "..."]}
 
-When the simulation's process ends, this process exits at once and leaves the rest
-unfinished.
+When the simulation's process ends, this process exits immediately and leaves the
+remaining work unfinished.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .jobs import Progress, VideoJob, key_of
 if TYPE_CHECKING:
     from .finisher import Finisher
 
-# Not `__name__`, which is `__main__` in the process.
+# Not `__name__`, which is `__main__` in the child process.
 logger = logging.getLogger("mjrec.rendering.background")
 
 _MODULE = "mjrec.rendering.background"
@@ -53,17 +53,17 @@ _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
-# The process itself gives up waiting after one timeout, so allow it several.
+# The child process itself gives up after one timeout, so wait for several timeouts.
 _PATIENCES = 3
 
 
 class Background:
     """Turns ended recordings into trajectories and videos while the caller continues.
 
-    `expect`, or the first recording, starts the process that does the work. It stays
-    with its workers until `stop`. If it dies, a second process continues; if that one
-    dies too, the rest stays pending. A process that hangs while `wait` waits for it is
-    killed and counts as dead. The process belongs to the one that created this object.
+    `expect`, or the first recording, starts the process that does the work. That
+    process and its workers run until `stop`. If the process dies, a second one
+    continues; if that one dies too, the rest stays pending. A process that hangs during
+    `wait` is killed and counts as dead. Forked processes must not use this object.
 
     Args:
         directory: the monitor directory.
@@ -75,8 +75,8 @@ class Background:
         InvalidArgument: `workers` is not a valid number of processes.
 
     Attributes:
-        failures: reasons for missing videos, by base name; for an episode without a
-            video, by the trajectory's base name.
+        failures: reasons for missing videos, keyed by base name. For an episode without
+            a video, the key is the trajectory's base name.
         waiting: the submitted recordings that are not done yet, in order.
     """
 
@@ -95,7 +95,7 @@ class Background:
         self._is_waited_for = self._is_prepared = False
         self._progress = Progress()
         self._is_stopped = self._waits_later = False
-        # How processes have died. After the second death, no more are started.
+        # How processes have died. After the second death, no new process is started.
         self._deaths: list[str] = []
         self.failures: dict[str, str] = {}
         # A dict used as an ordered set.
@@ -113,10 +113,10 @@ class Background:
             self._send(expected=None if recording is None else recording.name)
 
     def submit(self, recording: Path) -> None:
-        """Take over an ended trajectory, or a clip, without waiting.
+        """Accept an ended trajectory, or a clip, without waiting.
 
         Later failures are not raised but collected in `failures`. After `stop`, nothing
-        is done: the recording stays as it is.
+        is done, and the recording stays as it is.
 
         Raises:
             Error: this process was forked from the one that owns the object.
@@ -151,8 +151,8 @@ class Background:
                 continue
             on_progress(self._progress)
             has_news = timeout.wait(lambda slice_: wait_for_news([child], slice_))
-            # While the process waits for something itself, it polls every second and so
-            # uses CPU. If it is blocked for good (by a dead disk, say), it uses none.
+            # While the process itself waits, it polls every second and uses CPU time.
+            # If it is blocked forever (by a dead disk, for example), it does not.
             before, cpu_seconds = cpu_seconds, child.cpu_seconds()
             self._listen()
             if cpu_seconds > before:
@@ -183,9 +183,9 @@ class Background:
     def waiting_at_the_end(
         self, on_progress: Callable[[Progress], object]
     ) -> Iterator[None]:
-        """Make `wait` return at once inside the block, and wait when the block ends.
+        """Make `wait` return immediately inside the block, and wait at its end.
 
-        All monitors can then submit their recordings before the first wait.
+        This lets all monitors submit their recordings before the first wait.
         """
         self._waits_later = True
         try:
@@ -195,11 +195,11 @@ class Background:
         self.wait(on_progress)
 
     def stop(self) -> None:
-        """Stop at once; unfinished recordings stay pending. Idempotent."""
+        """Stop immediately. Unfinished recordings stay pending. Idempotent."""
         self._is_stopped = True
         child, self._child = self._child, None
         if child is not None and not self._was_forked():
-            # Failures that the process has reported belong in the manifest.
+            # Collect the failures that the process has reported, for the manifest.
             with contextlib.suppress(EOFError):
                 self._take_from(child)
             if not self.waiting:
@@ -245,10 +245,10 @@ class Background:
                 self.failures.update(message["failures"])
 
     def _replace(self, how: str) -> None:
-        """Replace a process that has died; the second one is not replaced.
+        """Replace a process that has died, unless it was the second one.
 
         Args:
-            how: how it died.
+            how: how the process died.
         """
         if self._child is not None:
             self._child.end()
@@ -266,7 +266,7 @@ class Background:
 
 
 class Share:
-    """A `Background` that several monitors use; none of them stops it."""
+    """A `Background` that several monitors share. None of them stops it."""
 
     def __init__(self, background: Background) -> None:
         self.expect, self.submit = background.expect, background.submit
@@ -281,8 +281,8 @@ class _Stopped(BaseException):
 
 
 def main() -> None:
-    """Finish the recordings that the simulation's process names until it ends."""
-    # Not imported at the top: the simulation's process does not need it.
+    """Finish recordings on behalf of the simulation's process until that ends."""
+    # Imported here because the simulation's process does not need it.
     from .pool import WorkerPool
 
     options = json.loads(sys.argv[1])
@@ -295,9 +295,9 @@ def main() -> None:
         first = parent.receive()
         with WorkerPool(options["workers"], directory=directory, forks=True) as pool:
             if "expected" in first:
-                # Before a second thread exists, because a fork would lose it.
+                # Fork before a second thread exists, which the fork would lose.
                 pool.start()
-            # The workers create their contexts while the rest is imported.
+            # The workers create their contexts during the following import.
             from .finisher import Finisher
 
             parent.listen(_leave)
@@ -312,7 +312,7 @@ def _stop(signum: int, frame: object) -> None:
 
 
 def _leave() -> None:
-    # The signal wakes the main thread, wherever it waits. If that thread does not exit
+    # The signal wakes the main thread, wherever that waits. If the thread does not exit
     # in time, the process is terminated after this function returns.
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_SECONDS_TO_LEAVE)
@@ -327,7 +327,7 @@ class _Work:
         parent: the simulation's process.
         directory: the monitor directory.
         strict: see `Background`.
-        is_waited_for: whether the parent waits.
+        is_waited_for: whether the parent is waiting.
         last_report: the time of the last report.
     """
 
@@ -339,7 +339,7 @@ class _Work:
     last_report: float = 0.0
 
     def do(self, first: Mapping[str, Any]) -> None:
-        """Handle the parent's messages and send it the results. Never returns.
+        """Handle the parent's messages and send back the results. Never returns.
 
         Args:
             first: the first message.
@@ -354,7 +354,7 @@ class _Work:
             elif finisher.is_ready() or self.is_waited_for:
                 job, result = finisher.do_next()
                 if not finisher:
-                    # Before the parent is notified, because it may then end the
+                    # Do this before notifying the parent, which may then end this
                     # process.
                     finisher.pool.rest()
                 self.parent.send(progress=vars(finisher.progress))
@@ -373,7 +373,7 @@ class _Work:
         if "expected" in message:
             self.finisher.pool.start()
             if (name := message["expected"]) is not None:
-                # It may still be running.
+                # The recording may still be running.
                 self.finisher.pool.prepare(self.directory / name)
         elif "recording" in message:
             name, at = message["recording"], self.directory

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing down which episodes of an evaluation get a video.
+"""Functions that record which episodes of an evaluation get a video.
 
-Monitors of an evaluation plan no videos, because the best episode of a task may be in
-any of its chunks. The choice is made when all episodes of a task have ended. It is then
+The monitors of an evaluation do not plan videos, because a task's best episode may be
+in any chunk. The choice is made when all episodes of a task have ended. It is then
 written into the chosen episodes' trajectories, journals and manifests, as if each
-monitor had made it. `finish` renders these videos, and `mjrec render` any that remain.
+monitor had made it. These videos are rendered by `finish`, or later by `mjrec render`.
 
-Episodes that can only be recorded live already have videos; those that were not chosen
-are removed.
+Episodes that can only be recorded live already have videos. The videos of episodes that
+were not chosen are removed.
 
-The process may be killed at any point, and all of this may be repeated.
+The process may be killed at any point, and every function may be called again.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ Chosen = Mapping[RecordingKey, Sequence[str]]
 def write_choice(
     folder: Path, chosen: Chosen, *, rule: str, finished: int, among: str = "*"
 ) -> set[RecordingKey]:
-    """Write down which episodes of a chunk get a video. Idempotent.
+    """Record which episodes of a chunk get a video. Idempotent.
 
-    An episode that was chosen earlier, from fewer episodes, keeps its video.
+    An episode that was chosen earlier from fewer episodes keeps its video.
 
     Args:
         folder: the chunk's monitor directory. Its monitors must be closed.
@@ -72,7 +72,7 @@ def write_choice(
         }
         filmed = {key for key in selections if key.number in live}
         for key, selection in selections.items():
-            # Recorded live, or chosen earlier from fewer episodes.
+            # The episode was recorded live, or chosen earlier from fewer episodes.
             video = folder / key.video_name
             if metadata_path(video).exists():
                 amend_metadata(video, {"selection": selection})
@@ -103,7 +103,7 @@ def _promise_videos(
 ) -> set[RecordingKey]:
     """Mark videos as pending in trajectories; return the episodes that can have one.
 
-    Episodes that are not in a finished trajectory are included.
+    The result includes episodes without a finished trajectory.
     """
     drawable: set[RecordingKey] = set()
     changes: dict[Path, Callable[[Any], Any]] = {}
@@ -130,9 +130,9 @@ def _with_video(video: Mapping[str, Any], known: Mapping[str, Any]) -> Any:
 
 
 def _remove_videos(video: Path) -> None:
-    """Remove the videos of an episode, each after its metadata.
+    """Remove the videos of an episode, removing the metadata of each one first.
 
-    The first camera's video is removed last, because it names those of the others.
+    The first camera's video is removed last, because its metadata lists the others.
     """
     for name, metadata in reversed(finished_videos(video)):
         path = video.with_name(name)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing a directory: everything that has ended but is not finished yet.
+"""Functions that finish all recordings in a directory that have ended.
 
-Closing, rendering, recovering and resuming all run this operation or parts of it. It
-finishes each recording (during a simulation, the background process does that for its
-monitor), updates manifests and second names, and finishes dead monitors (`recover` and
-`resume=True` do everything except the drawing). It may be interrupted or killed at any
-point and run again, and any number of processes may run it on one directory.
+Closing, rendering, recovering and resuming all run this operation or parts of it. The
+operation finishes each recording (during a simulation, the background process does that
+for its monitor), updates manifests and second names, and finishes dead monitors
+(`recover` and `resume=True` do everything except drawing). It can be repeated after an
+interrupt or a kill, and run by any number of processes on one directory.
 
-On an engine, the process that submits the jobs opens no trajectory and draws nothing.
-If it is killed, its workers' finished videos stay. The workers' settings may be
+With an engine, the process that submits the jobs opens no trajectory and draws nothing.
+If it is killed, its workers' finished videos are kept. The workers' settings may be
 `{"models": [sha256, ...]}`: compiled models that the submitting user has stored, which
 the workers may load. The result of a job is a `RenderedVideos`.
 """
@@ -51,10 +51,10 @@ def finish(
     strict: bool = False,
     on_progress: _OnProgress = lambda _: None,
 ) -> Iterator[RenderedVideos]:
-    """Finish what is pending in a directory, and yield the result of each recording.
+    """Finish the pending recordings in a directory, and yield the result of each.
 
     Recordings that need no work yield no result. Recordings that another process is
-    working on are left to it.
+    working on are left to that process.
 
     Args:
         directory: the monitor directory.
@@ -82,8 +82,8 @@ def finish(
     try:
         bring_up_to_date(directory)
     except FileNotWritten:
-        # On a full disk, a failure has been reported already. The next run writes the
-        # manifest.
+        # If the disk is full, a failure has already been reported. The next run writes
+        # the manifest.
         if not has_failed:
             raise
         return
@@ -95,8 +95,8 @@ def finish(
 def bring_up_to_date(directory: Path) -> None:
     """Give videos their second names, update manifests, and remove idle logs.
 
-    Call this after videos of a directory have been finished. It also completes what
-    an earlier run left undone.
+    Call this after videos in a directory have been finished. It also completes what an
+    earlier run left undone.
 
     Raises:
         UnreadableFile: a manifest is damaged.
@@ -118,7 +118,7 @@ def do_jobs(
     engine: Executor | None = None,
     on_progress: _OnProgress = lambda _: None,
 ) -> Iterator[RenderedVideos]:
-    """Do jobs and yield the result of each, unless there was nothing to do.
+    """Do jobs and yield the result of each, except where there was nothing to do.
 
     With an engine, results are yielded in the order in which the jobs end.
 
@@ -126,9 +126,9 @@ def do_jobs(
         jobs: the jobs to do. All workers of an engine must see their directories.
         directory: the directory whose CPU locks are used if `workers` is None.
         workers: number of processes that draw. None means one for each free CPU.
-        engine: an engine whose workers do the work instead.
-        on_progress: called after every frame, and when a job has ended; with an engine,
-            only when a job has ended.
+        engine: an engine whose workers do the work instead of this process.
+        on_progress: called after every frame and at the end of every job; with an
+            engine, only at the end of every job.
 
     Raises:
         Error: the engine cannot work.
@@ -169,7 +169,7 @@ def _done_on_engine(
     )
     with Run(engine, work) as run:
         for name, job in by_name.items():
-            # Workers may have other working directories.
+            # Workers may have a different working directory.
             video = None if job.video is None else job.video.absolute()
             sent = replace(job, directory=job.directory.absolute(), video=video)
             run.submit(name, **to_json(sent))
@@ -194,11 +194,11 @@ def _result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
     """Return the result of a job from its outcome on an engine."""
     if done.failure is None:
         assert done.value is not None
-        # The path as this process knows it.
+        # Use the path under which this process knows the directory.
         result = from_json(RenderedVideos, done.value)
         return replace(result, directory=job.video_directory)
     if job.variant is None:
-        # The worker died, so it could not do this itself.
+        # The worker died, so it could not note the failure itself.
         note_failure(job.directory, job.shown_name, done.failure)
     failures = {job.shown_name: done.failure}
     return RenderedVideos(directory=job.video_directory, failures=failures)
@@ -209,7 +209,7 @@ def environ_for_drawing() -> dict[str, str]:
     # In each of several workers, Mesa's rasterizer would start one thread per CPU.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
     if TRUST_VARIABLE in os.environ:
-        # Workers on other machines do not inherit it from this process.
+        # Workers on other machines do not inherit this variable from this process.
         environ[TRUST_VARIABLE] = os.environ[TRUST_VARIABLE]
     return environ
 
@@ -217,7 +217,7 @@ def environ_for_drawing() -> dict[str, str]:
 class VideoWorker:
     """A handler for `engines.jobs` that does one render job after another.
 
-    A child process draws. It is kept from job to job.
+    A child process draws. It is reused for all jobs.
 
     Args:
         settings: see the module docstring.

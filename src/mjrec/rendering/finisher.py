@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing recordings: the final trajectory files, and the videos.
+"""The finisher, which writes the final trajectory files and the videos.
 
 Recordings are finished one after another, each by all workers. A failure is reported,
-leaves its recording as it was, and does not stop the others.
+but leaves its recording unchanged and does not affect the other recordings.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
 
 class Finisher:
-    """Does the jobs added to it, in order, with one worker pool.
+    """Runs the jobs added to it, in order, with one worker pool.
 
     Args:
         pool: the worker pool; `close` closes it.
@@ -52,7 +52,7 @@ class Finisher:
     Attributes:
         pool: the worker pool.
         progress: the progress so far.
-        on_progress: as given; may be replaced.
+        on_progress: the argument `on_progress`. It may be replaced.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Finisher:
     def is_ready(self) -> bool:
         """Return whether the model of the next job exists."""
         _, plan = next(iter(self._waiting.values()))
-        # A running simulation may still write it.
+        # A running simulation may still be writing the file.
         return plan.model_file is None or plan.model_file.exists()
 
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
@@ -120,7 +120,7 @@ class Finisher:
             if lock is None:
                 return replace(nothing, elsewhere=(name,))
             try:
-                # Another process may have finished it since the job was added.
+                # Another process may have finished the recording since then.
                 plan = look_at(job.directory, job.key)
                 if plan is None:
                     return nothing
@@ -156,7 +156,7 @@ class Finisher:
 
     def _render(self, job: VideoJob, plan: Plan) -> RenderedVideos:
         if self._gl_failure is not None:
-            # Every other job would fail the same way, after a second of trying.
+            # Every other job would fail in the same way, after trying for a second.
             raise self._gl_failure
         try:
             return render_video(
@@ -176,7 +176,7 @@ def _plan(job: VideoJob) -> Plan | None:
     """Return the plan for a job; None if there is nothing to do.
 
     Raises:
-        InvalidArgument: the video would replace one recorded by another camera.
+        InvalidArgument: the video would replace a recorded video from another camera.
         Error: the recording cannot be read.
     """
     if job.variant is None:
@@ -190,8 +190,8 @@ def _plan(job: VideoJob) -> Plan | None:
     if job.video.with_suffix(".mp4").name in originals:
         raise InvalidArgument(
             f"{job.video.name} is a recorded video: this camera was recorded too. If "
-            "it is still missing, render the pending videos. Otherwise change more "
-            "than the camera, or say where to write the file."
+            "the video is missing, render the pending videos. Otherwise, change more "
+            "than the camera, or specify where to write the file."
         )
     frames = len(recorded.chosen(job.variant.max_fps).indices)
     return Plan(parts=(trajectory,), videos=(job.video,), frame_count=frames)

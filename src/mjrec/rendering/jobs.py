@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Render jobs, their settings and their results, as plain data.
 
-A job is about one recording. It is the same wherever it is done: in this process, in
-the background process of a simulation, or in an engine's worker. It can safely be done
-twice, even by two processes at once: the second finds nothing left to do, or replaces
-the file with an identical one.
+A job is for one recording. It is the same wherever it runs: in this process, in the
+background process of a simulation, or in an engine's worker. It can safely run twice,
+even in two processes at the same time: the second one finds nothing left to do, or
+replaces the file with an identical one.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class View:
     """The camera, size and quality of frames; None means as recorded.
 
     Attributes:
-        camera: the name or number of one of the model's cameras, -1 for the free
-            camera where the model places it, or the members of a `mujoco.MjvCamera` by
-            name (MuJoCo's defaults for those left out). Any value that `plain_camera`
+        camera: the name or number of one of the model's cameras, -1 for the free camera
+            where the model places it, or the members of a `mujoco.MjvCamera`, keyed by
+            name (omitted members have MuJoCo's defaults). Any value that `plain_camera`
             accepts may be passed.
         height: height in pixels.
         width: width in pixels.
@@ -56,8 +56,8 @@ class View:
 
     Raises:
         UnknownName: the quality, or a member of the `MjvCamera`, does not exist.
-        InvalidArgument: the size or the camera is invalid. Whether the model has the
-            camera is not checked here.
+        InvalidArgument: the size or the camera is invalid. It is not checked here
+            whether the model has the camera.
     """
 
     camera: PlainCamera | None = None
@@ -86,11 +86,11 @@ class Variant:
 
     Attributes:
         view: the camera, size and quality.
-        max_fps: maximum frames per second of simulated time. Of the recorded frames,
-            0, n, 2n ... with the smallest n that fits, and the last are drawn.
+        max_fps: maximum frames per second of simulated time. Recorded frames 0, n, 2n
+            ... with the smallest n that fits are drawn, and also the last frame.
         fps: frames per second of the file. If None, the video plays at its recorded
             speed.
-        annotate: whether episode, step, time and return are written on the frames.
+        annotate: whether the episode, step, time and return are written on the frames.
 
     Raises:
         InvalidArgument: `max_fps` or `fps` is not a valid rate.
@@ -123,7 +123,7 @@ def plain_camera(camera: Any) -> PlainCamera:
         return int(camera)
     if isinstance(camera, Mapping):
         return {name: _plain_member(name, camera[name]) for name in camera}
-    # Compared by type name, so that mujoco need not be imported here.
+    # Compare the type's name, so that mujoco need not be imported here.
     if type(camera).__name__ == "MjvCamera":
         return {n: _plain_member(n, getattr(camera, n)) for n in CAMERA_MEMBERS}
     raise InvalidArgument(
@@ -155,9 +155,9 @@ class Progress:
     Attributes:
         videos_done: number of videos that are finished or have failed.
         videos: number of videos known so far.
-        frames_done: number of frames of these videos that are drawn.
-        frames: number of frames of these videos. None if an engine draws them: the
-            frames of a video are then counted only when it is finished.
+        frames_done: number of frames of these videos that have been drawn.
+        frames: number of frames of these videos. None if an engine draws them, because
+            a video's frames are then counted only when the video is finished.
     """
 
     videos_done: int = 0
@@ -172,9 +172,9 @@ class RecordingKey:
 
     Attributes:
         infix: the infix of its monitor.
-        number: the episode's number; for a clip, the number of steps that the monitor
-            had recorded when it began.
-        is_clip: whether it is a clip.
+        number: the episode's number. For a clip, the number of steps that the monitor
+            had recorded when the clip began.
+        is_clip: whether the recording is a clip.
     """
 
     infix: str
@@ -183,7 +183,7 @@ class RecordingKey:
 
     @property
     def name(self) -> str:
-        """The base name of the trajectory, without extension, or of the first part."""
+        """The base name, without extension, of the trajectory or of the first part."""
         if self.is_clip:
             return clip_part_name(self.infix, self.number, 0)
         return trajectory_prefix(self.infix, self.number)
@@ -212,7 +212,7 @@ class RecordingKey:
 def key_of(name: str) -> RecordingKey | None:
     """Return the key of the recording that a file belongs to; None for other files.
 
-    The video of a clip that began with an episode has the name of that episode's video.
+    The video of a clip that began with an episode is named like that episode's video.
     """
     infix, step, video = infix_of(name), clip_step(name), VideoName.parse(name)
     if video is not None:
@@ -229,11 +229,11 @@ class VideoJob:
 
     Attributes:
         directory: the monitor directory.
-        recording: the name of one of its files; with a variant, of its trajectory.
+        recording: the name of any of its files; with a variant, of its trajectory.
         strict: whether a blank video is a failure.
-        variant: the changes for a video next to the original. None finishes what is
-            pending.
-        video: the path of that video. None without a variant.
+        variant: the changes for a video next to the original. With None, the job
+            finishes the pending videos.
+        video: the path of that video; None without a variant.
     """
 
     directory: Path
@@ -267,14 +267,14 @@ class VideoJob:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideos:
-    """The results of rendering, by file name.
+    """The results of rendering, keyed by file name.
 
     Attributes:
         directory: the directory of the videos.
         videos: number of frames of each rendered video.
-        trajectories: finished trajectories of episodes without a video.
+        trajectories: the finished trajectories of episodes without a video.
         failures: the reason for each video that could not be rendered.
-        blank: with `strict`, what is wrong with each blank video.
+        blank: with `strict`, the reason why each video counts as blank.
         elsewhere: videos that another process is rendering.
     """
 
@@ -304,7 +304,7 @@ class RenderedVideos:
         )
 
     def _repr_html_(self) -> str:
-        """Show the videos in a notebook, and why others are missing."""
+        """Show the videos in a notebook, and the reasons why others are missing."""
         facts = {"frames": sum(self.videos.values()), **self.failures, **self.blank}
         title = f"{len(self.videos)} rendered, {len(self.failures)} failed"
         return shown(title, facts, [self.directory / name for name in self.videos])

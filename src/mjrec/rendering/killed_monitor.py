@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing the files of a monitor that was killed, or closed without waiting.
+"""Functions that finish the files of a monitor that was killed or closed early.
 
 Recordings in flight become trajectories, live videos get their final names, missing
-lines are added to the journal, and the statistics and the manifest are written from it.
-Meanwhile the monitor's lock is held, so that the monitor looks open to all other
+lines are added to the journal, and the statistics and the manifest are derived from it.
+Meanwhile, the monitor's lock is held, so that the monitor looks open to all other
 processes.
 """
 
@@ -89,10 +89,10 @@ def finish_killed_monitor(
     """Finish all files of one monitor except pending videos, unless it is still open.
 
     Args:
-        directory: the directory that it recorded into.
+        directory: the directory that the monitor recorded into.
         infix: the monitor's infix.
         report: collects the results.
-        bundles: whether its trajectories are stored in one file.
+        bundles: whether the monitor's trajectories are stored in one file.
     """
     path = directory / lock_name(infix)
     with report.attempt(path.name):
@@ -100,7 +100,7 @@ def finish_killed_monitor(
         monitor = _KilledMonitor(
             directory=directory, infix=infix, report=report, bundles=bundles
         )
-        # Before the lock is taken, because a lock file is the sign of a killed monitor.
+        # Check before creating a lock file, which would look like a killed monitor's.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
         if lock is None:
@@ -110,11 +110,11 @@ def finish_killed_monitor(
         try:
             monitor.finish(is_behind=is_behind)
         except BaseException:
-            # Keep the file: its facts about the environment may exist nowhere else.
+            # Keep the file, whose facts about the environment may exist nowhere else.
             lock.let_go()
             raise
         lock.release()
-        # To a process that rendered meanwhile, the monitor looked open.
+        # Processes that rendered in the meantime found the monitor open.
         if (directory / manifest_name(infix)).exists():
             write_manifest_and_stats(directory, infix)
 
@@ -129,7 +129,7 @@ class _KilledMonitor:
     bundles: bool
 
     def _left(self, kind: Kind) -> list[Path]:
-        """Return the leftover files of one kind, as of now."""
+        """Return the current leftover files of one kind."""
         return leftovers(self._files(), kind)
 
     def finish(self, *, is_behind: bool) -> None:
@@ -144,7 +144,7 @@ class _KilledMonitor:
                 self._finish_log(log)
         # Turning logs into trajectories does not change the manifest.
         before = len(report.files)
-        # First cameras come last: their metadata names the other cameras' videos.
+        # First cameras come last, because their metadata lists the other videos.
         for note in sorted(self._left("video"), key=_is_first):
             path = note.with_name(final_name(note.name) or "")
             with report.attempt(path.name):
@@ -174,10 +174,10 @@ class _KilledMonitor:
             self.report.note(name, what)
 
     def _finish_log(self, log: Path) -> None:
-        """Turn the episodes of a log into trajectories; remove the log if it is idle.
+        """Turn the episodes in a log into trajectories; remove the log if it is idle.
 
         Raises:
-            UnreadableFile: the journal does not say what is in the log. The log stays.
+            UnreadableFile: the journal does not describe the log. The log stays.
         """
         in_flight = [
             each.path for each in spans.recordings_in(log) if each.is_in_flight
@@ -191,7 +191,7 @@ class _KilledMonitor:
             self.report.note(log.name, "nothing in flight, removed")
 
     def _finish_trajectories(self, paths: Iterable[Path]) -> None:
-        """Write episodes in their final form, or into the monitor's bundle."""
+        """Write the final trajectories, to separate files or to the bundle."""
         with contextlib.ExitStack() as claims:
             ours = [p for p in paths if claims.enter_context(self._claimed(p))]
             ours = [path for path in ours if not is_finished(path)]
@@ -207,7 +207,7 @@ class _KilledMonitor:
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
-        """Hold the lock of a file's recording; yield False if another process does."""
+        """Hold the lock of a file's recording; yield False if it is already held."""
         key = key_of(final_name(path.name) or path.name)
         if key is None:
             yield True
@@ -222,7 +222,7 @@ class _KilledMonitor:
     def _entries(self) -> dict[int, journal.JournalEntry | None]:
         """Journal entries of the episodes that have files; None where one was cut off.
 
-        Episodes without files are left out: there may be millions.
+        Episodes without files are left out, because there may be millions.
         """
         files, entries = self._files(), dict[int, journal.JournalEntry | None]()
         # An unreadable journal is reported when the statistics are written.
@@ -249,7 +249,7 @@ class _KilledMonitor:
         return {}
 
     def _known(self, number: int | None) -> dict[str, Any]:
-        """Return the metadata about an episode's end, as far as its files have it."""
+        """Return the available metadata about an episode's end."""
         facts = self._facts(number)
         entry = None if number is None else self._entries.get(number)
         known = {key: facts[key] for key in ("length", "reward") if key in facts}
@@ -264,7 +264,7 @@ class _KilledMonitor:
     # Journal, statistics, manifest
 
     def _missing_episodes(self, now: MonitorFiles) -> Iterator[_Line]:
-        """Yield the journal's missing lines for episodes with a trajectory or video."""
+        """Yield the lines that the journal lacks for episodes that have other files."""
         is_choosing = bool(MonitorResults(now).run.facts.get("keep"))
         for number in sorted(_numbers(now) - self._entries.keys()):
             facts = self._facts(number)
@@ -280,8 +280,8 @@ class _KilledMonitor:
     def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
         """Yield a line for each clip, deferred or live.
 
-        Some may repeat lines of the journal. Unreadable clips are left out; rendering
-        the directory reports them.
+        Some may repeat lines of the journal. Unreadable clips are left out; they are
+        reported when the directory is rendered.
         """
         in_flight = spans.recordings_in_flight(self.directory, self.infix)
         for key in {key_of(each.name) for each in in_flight}:
@@ -307,7 +307,7 @@ class _KilledMonitor:
                 yield "clip", {"episode_id": name.episode_id, "video": name.video}
 
     def _complete_journal(self, now: MonitorFiles) -> None:
-        """Add the lines that the monitor did not live to write."""
+        """Add the lines that the monitor could no longer write."""
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
         path = self.directory / journal_name(self.infix)
         writer = journal.JournalWriter(path, run=self._run_facts(now))
@@ -322,7 +322,7 @@ class _KilledMonitor:
             self.report.note(path.name, f"{counted(added, 'episode')} added")
 
     def _run_facts(self, now: MonitorFiles) -> Mapping[str, Any]:
-        """Return the first line for a journal that is lost or was never written."""
+        """Return the facts for the first line of a journal that is lost or missing."""
         with contextlib.suppress(OSError, ValueError):
             if run := locked_run(self.directory / lock_name(self.infix)):
                 return run

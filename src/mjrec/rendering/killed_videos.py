@@ -2,10 +2,10 @@
 """Videos that were being recorded live when their process was killed.
 
 The encoder encodes all frames that it received, and finishes its hidden file. A note
-next to that file says which video it is.
+next to that file describes the video.
 
-Text recordings are written to disk frame by frame and have no note. Their frames give
-the rate; the episode's trajectory, if it exists, gives the other facts.
+Text recordings are written to disk frame by frame and have no note. The rate is derived
+from their frames, and the other facts from the episode's trajectory, if it exists.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ _BROKEN = (
 
 
 def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Give a live video its final name and its metadata, for the frames that it has.
+    """Give a live video its final name, and metadata for the frames that it has.
 
-    A file that cannot be decoded keeps its hidden name; the metadata then says that the
-    video is broken, and why.
+    A file that cannot be decoded keeps its hidden name. The metadata then states that
+    the video is broken, and why.
 
     Args:
         path: the video. Call this for an episode's first camera last, because its
-            metadata names the other cameras' videos.
-        known: known facts about the episode: its `length`, its `reward`, and how it
-            ended, including `complete` if it did.
+            metadata lists the other cameras' videos.
+        known: known facts about the episode: its `length`, its `reward`, and, if it has
+            ended, the facts about its end, including `complete`.
 
     Yields:
-        The name of the file and what was done. Nothing if only the note was left.
+        The file's name and what was done with it. Nothing if only the note was left.
 
     Raises:
         Error: the encoder is still running, or the files cannot be written.
@@ -72,18 +72,18 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
     try:
         about, facts = _read_note(note_path(path))
     except UnreadableFile:
-        # A note is written before there is a video.
+        # A note is written before its video exists.
         note_path(path).unlink(missing_ok=True)
         return
     part = next(iter(unfinished_files(path)), path)
     if is_locked(part):
         raise Error(
-            f"The encoder of {path.name} is still finishing its file. To wait longer: "
+            f"The encoder for {path.name} is still finishing its file. To wait longer: "
             f"mjrec recover --timeout 60 {path.parent}"
         )
     if not metadata_path(path).exists():
         if _FIRST_STEP in about:
-            # A clip spans episodes: facts about one do not describe the clip's end.
+            # A clip spans episodes. Facts about one do not describe its end.
             known = {}
         try:
             found = _finish_files(part, path, facts)
@@ -92,8 +92,8 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
         except EncoderError as error:
             ending = known if "complete" in known else {**known, **CUT_BY_KILL}
             metadata = {**about, **ending, "empty": True, "recovered": True}
-            done = metadata_path(path).name, "there was no frame yet"
-            # Frames are hashed before they are encoded, so the encoder may never have
+            done = metadata_path(path).name, "there were no frames yet"
+            # Frames are hashed before they are encoded, so the encoder may not have
             # received the last one.
             if _hashed_frames(path) > 1:
                 why = (error.stderr.strip().splitlines() or [str(error)])[-1]
@@ -131,7 +131,7 @@ def _hashes(video: Path) -> list[Path]:
 
 
 def _hashed_frames(video: Path) -> int:
-    """Return the number of frames that were, or soon would be, given to the encoder."""
+    """Return the number of frames that were, or were about to be, encoded."""
     texts = [path.read_text("ascii", "replace") for path in _hashes(video)]
     return sum(not line.startswith("#") for t in texts for line in t.splitlines())
 
@@ -184,7 +184,7 @@ def _metadata(
     steps = [*range(0, length, stride), length]
     is_whole = len(steps) == frame_count and frames_per_step == 1
     if not is_whole or "complete" not in known:
-        # The last frames had not reached the encoder.
+        # The encoder had not received the last frames.
         steps = [*range(0, frame_count * stride, stride)]
         known = {**_sums(known), **CUT_BY_KILL}
     # The step of each frame is known only if there is one frame per step.
@@ -212,11 +212,11 @@ def finish_text(
     Args:
         part: the hidden file that the frames were written to.
         path: the recording to write.
-        facts: the facts in its episode's trajectory; empty without one.
+        facts: the facts in the episode's trajectory; empty without a trajectory.
         known: see `finish_video`.
 
     Yields:
-        The name of the file and what was done. Nothing if the recording already exists.
+        The name of the file and what was done with it. Nothing if the recording exists.
 
     Raises:
         Error: the files cannot be written.
@@ -225,7 +225,7 @@ def finish_text(
         try:
             rate, frames = unfinished_recording(part)
         except UnreadableFile:
-            # It does not contain a complete frame.
+            # The file does not contain a complete frame.
             part.unlink(missing_ok=True)
             yield part.name, "unfinished, removed"
             return

@@ -29,7 +29,7 @@ from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
-# "video" is the note of a live video, "text" the frames of a text recording, and
+# "video" is the note about a live video, "text" the frames of a text recording, and
 # "stale" an unfinished file that no process will finish, or a dead process's lock.
 # Leftovers are finished in this order, after the logs.
 Kind = Literal["video", "text", "stale"]
@@ -41,7 +41,7 @@ class RecoveredFile:
 
     Attributes:
         name: the file's final base name.
-        what: a description of what was done, or why it failed.
+        what: a description of what was done with the file, or why it failed.
     """
 
     name: str
@@ -52,7 +52,7 @@ class RecoveredFile:
 
 
 def logs_left(files: MonitorFiles) -> list[Path]:
-    """Return the row logs of a monitor that contain episodes, or are useless."""
+    """Return the row logs of a monitor that contain episodes or can be removed."""
     return [log for log in sorted(files.logs) if _has_work(log)]
 
 
@@ -62,25 +62,25 @@ def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
 
 
 def has_leftovers(files: MonitorFiles) -> bool:
-    """Return whether a monitor has left anything to do."""
+    """Return whether a monitor has left any work to do."""
     is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
     return is_left or lacks_results(files)
 
 
 def is_at_work(directory: Path, infix: str) -> bool:
-    """Return whether an encoder or renderer still works on a dead monitor's files."""
+    """Return whether a process still encodes or renders for a dead monitor."""
     files = files_of(directory, infix)
     hidden = [path for path in files.paths if path.name.startswith(".")]
     return any(is_locked(path) for path in hidden if path != files.lock)
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
-    """Return the stale files that belong to no single monitor of a directory.
+    """Return the stale files in a directory that do not belong to a single monitor.
 
-    These are unfinished model files, unless a monitor is open, and locks.
+    These are locks and, unless a monitor is open, unfinished model files.
     """
-    # List the files before looking at locks: a process that is working on a listed
-    # file has held its lock since before.
+    # List the files before looking at locks, because any process that is working on a
+    # listed file already held its lock then.
     hidden = [p for p in iter_monitor_files(directory, hidden=True) if p.name[0] == "."]
     models = [path for path in hidden if path.name.startswith(".openaigym.model.")]
     if models and any(files.is_open for files in monitors_of(directory)):
@@ -100,7 +100,7 @@ def _has_work(log: Path) -> bool:
 
 
 def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
-    """Return the kind of a leftover file; None if nothing has to be done with it."""
+    """Return the kind of a leftover file; None if there is nothing to do with it."""
     if path.suffix == ".lock" and path != files.lock:
         return None if is_locked(path) else "stale"
     final = final_name(path.name)
@@ -108,7 +108,7 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
         return None
     video = path.with_name(final)
     if is_note(path.name):
-        # The data of a broken video stays, in case someone can repair it.
+        # The data of a broken video is kept, in case it can be repaired.
         return None if is_broken(metadata_path(video)) else "video"
     name = VideoName.parse(final)
     if name is None:
@@ -126,7 +126,7 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
 
 
 def lacks_results(files: MonitorFiles) -> bool:
-    """Return whether statistics or manifest are missing, or may be outdated.
+    """Return whether the statistics or the manifest are missing, or may be outdated.
 
     A monitor that closed normally wrote both and removed its lock.
     """

@@ -4,7 +4,7 @@
 All processes that render into one directory share the machine's CPUs. Each CPU is
 represented by a lock file, `.openaigym.render.<number>.lock`, and the process that
 holds it may keep one worker busy. If eight processes record into one directory on a
-machine with two CPUs, two workers are busy, not sixteen.
+machine with two CPUs, only two workers are busy, not sixteen.
 """
 
 from __future__ import annotations
@@ -51,24 +51,24 @@ _SECONDS_BETWEEN_TRIES = 0.1
 
 
 class WorkerPool:
-    """Draws frames in worker processes, and returns them in order.
+    """Draws frames in worker processes and returns them in order.
 
     With n workers, worker k draws frames k, k+n, k+2n ... of a job and writes them to
     its pipe. At most two frames per worker are buffered here. A worker that dies is
-    restarted at the frame that it owes; if it dies twice at the same frame, that is an
-    error. A worker that sends nothing for `timeout_s` while the pool waits for it is
+    restarted at the frame it owes. If it dies twice at the same frame, an error is
+    raised. A worker that sends nothing for `timeout_s` while the pool waits for it is
     killed and counts as dead; the log shows where it hung.
 
     The processes start when needed, or with `start`, and stay until `close`, garbage
     collection or the end of this process. Only a worker whose job is abandoned midway
     is terminated, and it is restarted for the next job.
 
-    Workers use the backend that `MUJOCO_GL` names. If it names none, or turns rendering
-    off (which applies to the simulation), each starts with EGL and checks a test frame
-    of its own first. Only if that fails does the pool look for the first backend that
-    works, like `mjrec.use_gl`.
+    Workers use the backend that `MUJOCO_GL` names. If it names none or turns rendering
+    off (which applies only to the simulation), each worker starts with EGL and first
+    checks a test frame. Only if that fails does the pool look for the first backend
+    that works, like `mjrec.use_gl`.
 
-    Use it from one thread at a time.
+    Use a pool from one thread at a time.
 
     ::
 
@@ -81,9 +81,9 @@ class WorkerPool:
             means one for each of the directory's CPUs that is free when a job begins.
         directory: the directory whose CPU locks are used.
         trust_models: whether workers load compiled models from untrusted sources. They
-            do so in any case if `MJREC_TRUST_MODELS` allows it here.
+            always do so if this process's `MJREC_TRUST_MODELS` allows it.
         forks: whether `start` forks this process, so that modules are imported only
-            once. Until then it must have a single thread, and it must never use OpenGL.
+            once. It must have a single thread until then, and must never use OpenGL.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1.
@@ -104,9 +104,9 @@ class WorkerPool:
     ) -> None:
         self._fixed = check_workers(workers)
         count = self._fixed or usable_cpus()
-        # A pool that forks draws beside a simulation, which needs the other CPUs.
+        # A pool that forks draws alongside a simulation, which needs the other CPUs.
         self._environ = _environment(os.environ, alone=count == 1 and not forks)
-        # The user's backend, or one that is known to work, needs no test.
+        # A backend that the user chose, or that is known to work, needs no test.
         self._is_chosen = "MUJOCO_GL" in self._environ
         if trust_models:
             self._environ[TRUST_VARIABLE] = ALL_MODELS
@@ -123,9 +123,9 @@ class WorkerPool:
         self._process_id = os.getpid()
 
     def start(self) -> None:
-        """Start the workers now, so that the first frame comes sooner. Idempotent.
+        """Start the workers now, so that the first frame is ready sooner. Idempotent.
 
-        Errors are reported when there is something to draw.
+        Errors are reported when frames are requested.
         """
         with contextlib.suppress(Error):
             self._check_usable()
@@ -136,7 +136,7 @@ class WorkerPool:
     def prepare(self, trajectory: Path) -> None:
         """Make idle workers load a trajectory's model, which may not exist yet.
 
-        Nothing is done while a job is running, or by workers that are not started.
+        Nothing is done while a job is running, or by workers that have not started.
         Errors are reported when frames are requested.
         """
         if self._job is None:
@@ -161,8 +161,8 @@ class WorkerPool:
     ) -> Iterator[Frame]:
         """Return the frames of a trajectory, in the order of `indices`.
 
-        Waits for a free CPU and draws the first frame before returning. Each frame is a
-        new array.
+        This waits for a free CPU and draws the first frame before it returns. Each
+        frame is a new array.
 
         Args:
             trajectory: the trajectory's file.
@@ -175,7 +175,7 @@ class WorkerPool:
             UnreadableFile: the trajectory or its model cannot be read.
             InvalidArgument: a frame does not exist, the model lacks the camera, or the
                 driver cannot draw frames of this size.
-            GLError: no backend works here, or all attempts to draw hang.
+            GLError: no backend works on this machine, or all attempts to draw hang.
             Error: a worker died twice at the same frame. The message contains the
                 signal and the worker's last output. Errors at later frames are raised
                 when the iterator reaches them.
@@ -191,9 +191,9 @@ class WorkerPool:
     def frames_of(
         self, drawing: Mapping[str, Any], indices: Sequence[int]
     ) -> Iterator[Frame]:
-        """Return the frames of anything that `worker.open_drawing` opens.
+        """Return the frames of any drawing that `worker.open_drawing` can open.
 
-        Works like `frames`. The remaining frames of an earlier call are abandoned.
+        This works like `frames`. The remaining frames of an earlier call are abandoned.
         """
         self._check_usable()
         for worker in self._workers:
@@ -206,7 +206,7 @@ class WorkerPool:
         return itertools.chain(first, drawn)
 
     def close(self) -> None:
-        """End the processes at once, whatever they are doing. Idempotent."""
+        """End the processes immediately, whatever they are doing. Idempotent."""
         self._closed = True
         for worker in self._workers:
             worker.end()
@@ -230,7 +230,7 @@ class WorkerPool:
             )
 
     def _free(self) -> int:
-        """Lock the CPUs that are free; return the number of workers that may draw."""
+        """Lock the free CPUs, and return the number of workers that may draw."""
         if self._fixed is not None or self._directory is None:
             return len(self._workers)
         for number in range(len(self._workers)):
@@ -248,7 +248,7 @@ class WorkerPool:
         if not self._is_chosen:
             environ = environment_for(BACKENDS[0], environ)
         try:
-            # The working directory is "/", so that workers do not keep any directory
+            # The working directory is "/", so that workers do not prevent any directory
             # from being removed or unmounted.
             worker.child = Child(
                 _MODULE, environ=environ, cwd="/", fork=self._main_of_fork(environ)
@@ -264,13 +264,13 @@ class WorkerPool:
         if not self._forks or threading.active_count() > 1:
             return None
         try:
-            # mujoco reads them when it is imported. If this backend fails, the user's
-            # own choice is looked up again.
+            # mujoco reads these variables when it is imported. If this backend fails,
+            # the user's choice is looked up again.
             with changed_environ(environ):
-                # Not imported at the top: other processes that have a pool never draw.
+                # Imported here because other processes that have a pool never draw.
                 from .worker import main
         except Exception:
-            # A separate worker process reports the reason, or another backend works.
+            # A separate worker process reports the reason or uses another backend.
             self._forks = False
             return None
         return main
@@ -278,7 +278,7 @@ class WorkerPool:
     def _choose_backend(self) -> None:
         """Choose the first backend that works, and stop forking.
 
-        This process has imported mujoco for EGL, so a fork of it could not use another
+        This process has imported mujoco for EGL, so its forks could not use another
         backend.
 
         Raises:
@@ -304,7 +304,7 @@ class WorkerPool:
                     self._check_usable(job)
                 frame = worker.arrived.popleft()
                 self._timeout.renew()
-                # Before yielding, because the caller may be busy for a long time.
+                # Listen before yielding, because the caller may be busy for a while.
                 self._listen(job, 0)
                 yield frame
                 self._check_usable(job)
@@ -329,7 +329,7 @@ class WorkerPool:
                 self._order(worker, job)
         self._timeout.wait(lambda seconds: self._listen(job, seconds))
         if self._timeout.is_over:
-            # The other workers have full buffers or owe nothing, so they do not hang.
+            # The other workers have full buffers or owe nothing, so none is hanging.
             for worker in hungry:
                 self._end_hanging(worker, job)
             self._timeout.renew()
@@ -353,7 +353,7 @@ class WorkerPool:
             except EOFError:
                 self._lose(worker, job, "died", f"it {worker.child.last_words()}")
             except BaseException:
-                # Ctrl-C within a message: the rest of the pipe cannot be understood.
+                # After Ctrl-C within a message, the rest of the pipe cannot be decoded.
                 worker.end()
                 raise
         return bool(heard)
@@ -373,7 +373,7 @@ class WorkerPool:
                 continue
             elif "untried" in message:
                 logger.info("A worker cannot draw with EGL: %s", message["untried"])
-                # It exits and is replaced.
+                # The worker exits and is replaced.
                 self._choose_backend()
             elif "error" in message:
                 worker.error = unpacked(message["error"])
@@ -399,7 +399,7 @@ class WorkerPool:
         self._lose(worker, job, "hung", how)
 
     def _lose(self, worker: _Worker, job: _Job, what: str, how: str) -> None:
-        """End a worker's process; the second loss at the same frame is an error."""
+        """Replace a lost worker. A second loss at the same frame is an error."""
         worker.end()
         if not worker.is_tried:
             self._choose_backend()
@@ -407,7 +407,7 @@ class WorkerPool:
         position = worker.owes.start
         if worker.lost_at == position:
             source = job.drawing.get("trajectory", "the given states")
-            # If nothing was ever drawn, this frame is not the cause of a hang.
+            # If nothing was ever drawn, this frame did not cause the hang.
             kind = Error if self._has_drawn or what == "died" else GLError
             worker.error = kind(
                 f"A worker {what} while drawing frame {job.indices[position]} of "
@@ -420,7 +420,7 @@ class WorkerPool:
 
 @dataclass(frozen=True)
 class _Job:
-    """A drawing, the numbers of its frames to draw, and the workers that draw them."""
+    """A drawing, the numbers of the frames to draw, and the workers that draw them."""
 
     drawing: Mapping[str, Any]
     indices: Sequence[int]
@@ -436,7 +436,7 @@ class _Worker:
         arrived: the frames that it has sent and that have not been taken yet.
         owes: the positions of the frames that it still has to send.
         error: the error that replaces the next frame.
-        lost_at: the position at which a process was last lost.
+        lost_at: the position of the frame at which a process was last lost.
         is_tried: whether its backend is the user's choice, or has passed its test.
     """
 
@@ -456,7 +456,7 @@ class _Worker:
         return bool(self.owes) and self.error is None and not is_full
 
     def leave(self) -> None:
-        """Forget the job; end the process if it has more to send."""
+        """Forget the job, ending the process if it has more to send."""
         if self.owes and self.error is None:
             self.end()
         self.owes = range(0)
@@ -471,9 +471,9 @@ class _Worker:
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
-    """Return the environment variables of workers.
+    """Return the environment variables for workers.
 
-    They lack `MUJOCO_GL` if a backend must still be chosen.
+    `MUJOCO_GL` is left out if a backend must still be chosen.
 
     Args:
         environ: this process's environment variables.
@@ -491,6 +491,6 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
         # In each worker, Mesa's rasterizer would start one thread per CPU. Even a
-        # single extra thread gains nothing: the worker would only wait for it.
+        # single extra thread gains nothing, because the worker would wait for it.
         changed.setdefault("LP_NUM_THREADS", "0")
     return changed

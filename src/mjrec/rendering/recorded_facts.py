@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The facts of a recording, checked for rendering, and its frames and captions.
+"""The facts about a recording, checked for rendering, and its frames and captions.
 
-A recording may come from a stranger. Its facts are checked here, once, so that later
-code can rely on a rate being a rate, and on paths staying inside the directory.
+A recording may come from a stranger. Its facts are checked here once, so that later
+code can rely on valid rates, and on paths that stay inside the directory.
 """
 
 from __future__ import annotations
@@ -55,22 +55,22 @@ logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 20
 
 # A rate that the user requested is stored as given, such as 29.97, or as the exact
-# fraction of a float. `Fraction` accepts more, but 1e20000000 would keep it busy.
+# fraction of a float. `Fraction` accepts more, but 1e20000000 would take ages to parse.
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 
 
 def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
-    """Open a trajectory, which may be a stranger's, and check its facts.
+    """Open a trajectory, which may come from a stranger, and check its facts.
 
-    Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are valid, None,
-    or missing; `stride`, `kept` and `candidate` are valid or missing.
+    Afterwards, `rate`, `timestep`, `scene`, `model`, `video` and `clip` are valid,
+    None, or missing; `stride`, `kept` and `candidate` are valid or missing.
 
     Args:
         path: the trajectory.
         is_vetted: whether another mjrec process has already opened it successfully.
 
     Raises:
-        UnreadableFile: `open_vetted_trajectory` raised it, or a fact is invalid.
+        UnreadableFile: a fact is invalid, or see `open_vetted_trajectory`.
     """
     reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
@@ -85,13 +85,13 @@ def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryRead
 def model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
     """Return the model file that rendering a recording needs; None if unknown."""
     model = facts.get("model") or {}
-    # The compiled model is written first; its sources may never be written.
+    # The compiled model is written first. Its sources may never be written.
     name = model.get("mjb") or model.get("xml")
     return None if name is None else directory / name
 
 
 def video_facts(facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a recording's facts about its video; empty if it has none."""
+    """Return a recording's facts about its video; empty if there is no video."""
     return facts.get("video") or {}
 
 
@@ -99,11 +99,11 @@ def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
     """Return the path of the video of a trajectory or of a clip's part.
 
     Raises:
-        UnreadableFile: the recording names no video, or one that is not its own.
+        UnreadableFile: the recording names no video, or a video that is not its own.
     """
     name = str(video_facts(facts).get("name"))
     infix, step = infix_of(recording.name), clip_step(recording.name)
-    # Only the name of a clip's video says in which episode it began.
+    # Only the name of a clip's video shows in which episode the clip began.
     episode = episode_of(recording.name if step is None else name)
     own: set[str] = set()
     if infix is not None and episode is not None:
@@ -113,13 +113,13 @@ def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
     if name not in own:
         raise UnreadableFile(
             recording,
-            f"the video that it names, {name!r:.200}, does not belong to its episode",
+            f"the video in its facts, {name!r:.200}, does not belong to its episode",
         )
     return recording.with_name(name)
 
 
 def further_video_paths(recording: Path, facts: Mapping[str, Any]) -> list[Path]:
-    """Return the paths of the videos of a recording's other cameras.
+    """Return the paths of the videos from a recording's other cameras.
 
     Raises:
         UnreadableFile: see `video_path`.
@@ -139,7 +139,7 @@ class ChosenFrames(NamedTuple):
 
     Attributes:
         indices: the numbers of the frames.
-        every: the stride between them; the last one may be closer.
+        every: the stride between frames; the last stride may be smaller.
     """
 
     indices: list[int]
@@ -176,8 +176,8 @@ def chosen_frames(
 ) -> ChosenFrames:
     """Select recorded frames so that their rate does not exceed `max_fps`.
 
-    The selection is 0, n, 2n ... with the smallest whole n that fits, and the last
-    frame.
+    The selection consists of frames 0, n, 2n ... with the smallest n that fits, and the
+    last frame.
 
     Args:
         count: number of recorded frames.
@@ -197,8 +197,8 @@ def chosen_frames(
         # rate.
         elif count > 1:
             raise InvalidArgument(
-                "max_fps needs the number of control steps per second, but this "
-                "recording ended before the number was known. Omit max_fps."
+                "max_fps requires the number of control steps per second, but this "
+                "recording ended before it was known. Omit max_fps."
             )
     last = [count - 1] if count else []
     return ChosenFrames([*range(0, count - 1, every), *last], every)
@@ -215,17 +215,17 @@ def captions(reader: TrajectoryReader, indices: Sequence[int]) -> Iterator[Capti
     """Return the captions of some frames of a trajectory, in the order of `indices`.
 
     The return is the sum of the rewards up to the frame's step. The time is the
-    simulated time since the reset. Without recorded states it is computed from the
-    steps; if their duration is unknown, it is None. A clip's part may begin in the
-    middle of an episode; its facts contain what came before.
+    simulated time since the reset. Without recorded states, the time is computed from
+    the steps; if their duration is unknown, it is None. A clip's part may begin in
+    mid-episode; its facts contain the earlier time and rewards.
 
     Raises:
-        UnreadableFile: the file is damaged. It is read completely before this returns.
+        UnreadableFile: the file is damaged. The call raises this, not the iterator.
     """
     facts = reader.facts
     episode_id, before = int(facts.get("episode_id") or 0), facts.get("clip") or {}
     steps = reader.frame_steps[list(indices)]
-    # Summed one by one, as the monitor does, so that rounding is the same.
+    # Add the rewards one by one, as the monitor does, so that rounding is the same.
     first = float(before.get("reward_before", 0.0))
     sums = np.cumsum(np.concatenate([[first], reader.rewards]))
     rewards = sums[np.minimum(steps, len(sums) - 1)]
@@ -258,13 +258,13 @@ def _times(
 
 
 def _clock(reader: TrajectoryReader) -> NDArray[np.float64] | None:
-    """Return the simulated time of each state; None without states."""
+    """Return the simulated time of each state; None if there are no states."""
     clock = reader.columns.get("time")
     if clock is None or not reader.row_count:
         return None
     rows = max(1, _BLOCK_BYTES // reader.dtype["state"].itemsize)
     blocks = [
-        # Copied, so that the states themselves can be freed.
+        # Copy the times, so that the states themselves can be freed.
         reader.states(start, min(start + rows, reader.row_count))[:, clock.start].copy()
         for start in range(0, reader.row_count, rows)
     ]
@@ -295,7 +295,7 @@ def _stride(value: Any) -> int:
 def _cameras(value: Any) -> tuple[PlainCamera | None, ...]:
     cameras = list_of(optional(plain_camera))(value)
     if not cameras or None in cameras[1:]:
-        raise ValueError("only the first can be the environment's own view")
+        raise ValueError("only the first camera can be the environment's own view")
     return cameras
 
 
@@ -333,7 +333,7 @@ _FACTS: Mapping[str, Callable[[Any], Any]] = {
     "exception": optional(mapping),
     "model": _object_of(mjb=optional(base_name), xml=optional(base_name)),
     "video": _object_of(
-        # `video_path` checks that it belongs to the recording's episode.
+        # `video_path` checks that the video belongs to the recording's episode.
         name=text,
         quality=one_of(*QUALITIES),
         recording=one_of("deferred", "live"),

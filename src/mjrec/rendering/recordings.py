@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of a directory, and the work left to do on each.
+"""The recordings in a directory, and the work left to do on each.
 
 A recording is an episode, or a clip (a video counted in steps). Its rows are divided
 into parts: an episode has one, and a clip that continues across resets has one for each
-episode. An episode's part may become a file and stay; a clip's parts are dropped when
-its video is finished.
+episode. An episode's part may become a file and be kept. A clip's parts are dropped
+when its video is finished.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from .recorded_facts import (
     video_path,
 )
 
-# For an episode that ended before its second step; any rate would do.
+# Used for an episode that ended before its second step; any rate would do.
 _RATE_OF_ONE_FRAME = Fraction(30)
 
 
@@ -55,7 +55,7 @@ class Plan:
         parts: the paths of its parts, in order. Parts still in a log have no file.
         videos: the videos to render, the first camera's first.
         frame_count: total number of frames to render in all videos.
-        logs: the logs that still contain its rows.
+        logs: the logs that still contain rows of the recording.
         is_kept: whether the trajectory stays after the video is finished.
         model_file: the model file that rendering needs, if known.
     """
@@ -70,14 +70,14 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """The facts of a recording, from all of its parts.
+    """The facts about a recording, from all of its parts.
 
     Attributes:
         parts: the files, in order.
-        facts: the facts of each part.
-        frame_counts: the number of frames of each part.
-        frame_steps: the step of each frame. For a clip, the frame's own number, because
-            resets have a frame but are not steps.
+        facts: the facts about each part.
+        frame_counts: the number of frames in each part.
+        frame_steps: the step of each frame. For a clip, the number of the frame,
+            because resets have frames but are not steps.
         step_count: number of steps in all parts.
         reward: the sum of the rewards over all steps.
     """
@@ -96,14 +96,14 @@ class Recorded:
 
     @property
     def timing(self) -> Mapping[str, Any]:
-        """The facts of the first part that records how long a step takes."""
+        """The facts about the first part that records how long a step takes."""
         known = (facts for facts in self.facts if facts.get("timestep") is not None)
         return next(known, self.facts[0])
 
     def chosen(self, max_fps: float | Fraction | None = None) -> ChosenFrames:
         """Return the frames to render, numbered across all parts.
 
-        An episode records only the frames that its video needs. A clip records all
+        An episode contains only the frames that its video needs. A clip contains all
         frames, and the selection 0, n, 2n ... does not restart with each part.
         """
         if self.is_clip and recorded_rate(self.timing) is not None:
@@ -112,7 +112,7 @@ class Recorded:
         return chosen_frames(sum(self.frame_counts), self.timing, max_fps)
 
     def usual_fps(self, chosen: ChosenFrames) -> Fraction:
-        """Return the frame rate of a video that plays at its recorded speed."""
+        """Return the frame rate for playing the video at its recorded speed."""
         asked = video_facts(self.facts[0]).get("fps")
         if asked is None:
             rate = recorded_rate(self.timing) or _RATE_OF_ONE_FRAME
@@ -122,7 +122,7 @@ class Recorded:
 
 
 def read_recording(parts: Sequence[Path]) -> Recorded:
-    """Read the facts of a recording's parts.
+    """Read the facts about a recording's parts.
 
     Raises:
         UnreadableFile: a part is missing or damaged.
@@ -165,7 +165,7 @@ def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
     if not key.is_clip:
         path = find_trajectory(directory, key.infix, key.number)
         return [] if path is None else [path]
-    # The logs have the same order.
+    # The logs are in the same order.
     in_flight = (each.path for each in recordings_in_flight(directory, key.infix))
     return [path for path in in_flight if key_of(path.name) == key]
 
@@ -181,7 +181,7 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 
 
 def _is_done(directory: Path, key: RecordingKey) -> bool:
-    """Return whether a recording is an episode whose trajectory and video are done."""
+    """Return whether this is an episode with a finished trajectory and video."""
     if key.is_clip or not is_done(directory / key.video_name):
         return False
     return is_finished(directory / f"{key.name}{FINISHED}")
@@ -190,19 +190,19 @@ def _is_done(directory: Path, key: RecordingKey) -> bool:
 def look_at(directory: Path, key: RecordingKey) -> Plan | None:
     """Return the work left to do on a recording; None if there is none.
 
-    A recording that is still running, or whose monitor has not decided yet whether it
-    gets a video, is left to its monitor. In both cases the monitor's lock is held, and
-    the log lacks the episode's end or marks it as a candidate.
+    A recording is left to its monitor if it is still running, or if the monitor has not
+    decided yet whether it gets a video. In both cases, the monitor's lock is held, and
+    the log lacks the episode's end or marks the episode as a candidate.
 
     Raises:
         UnreadableFile: the rows are missing or damaged, have a newer format, or contain
             an invalid fact.
         OSError: the monitor's lock cannot be examined.
     """
-    # Most recordings of a directory are done, and need not be opened.
+    # Most recordings in a directory are done and need not be opened.
     if _is_done(directory, key):
         return None
-    # Checked first: a part that appears later belongs to an open monitor.
+    # Check this first, because a part that appears later belongs to an open monitor.
     is_open = is_locked(directory / lock_name(key.infix))
     parts = parts_of(directory, key)
     if not parts:
@@ -232,7 +232,7 @@ def look_at(directory: Path, key: RecordingKey) -> Plan | None:
 
 
 def claim(directory: Path, key: RecordingKey) -> Lock | None:
-    """Return the lock of a recording, or None if another process holds it.
+    """Acquire the lock of a recording, or return None if another process holds it.
 
     Raises:
         DirectoryNotWritable: a lock cannot be created in the directory.
@@ -241,10 +241,10 @@ def claim(directory: Path, key: RecordingKey) -> Lock | None:
 
 
 def remove_unfinished(video: Path) -> None:
-    """Remove the files that a killed renderer left of a deferred video.
+    """Remove the files that a killed renderer left for a deferred video.
 
     Only the process that holds the recording's lock may call this, so that no other
-    process is writing them.
+    process is writing the files.
     """
     for final in (video, frame_hash_path(video), metadata_path(video)):
         for part in unfinished_files(final):

@@ -16,7 +16,7 @@ from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
 from .leftovers import RecoveredFile, has_leftovers, is_at_work, stale_shared_files
 
-# Only one process at a time recovers a directory.
+# Only one process at a time may recover a directory.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
 _MOMENT = 0.05
@@ -24,12 +24,12 @@ _MOMENT = 0.05
 
 @dataclass(frozen=True)
 class Recovery:
-    """The result of `recover`. It is false if there was nothing to do.
+    """The result of `recover`, which is false if there was nothing to do.
 
     Attributes:
         directory: the directory.
         files: files that were finished.
-        failures: files that could not be finished, with the reasons. They are
+        failures: files that could not be finished, with the reasons. The files are
             unchanged.
         open_monitors: infixes of monitors that are still recording. Their files were
             left alone.
@@ -65,25 +65,25 @@ def recover(
     timeout: float = _SECONDS,
     bundle: bool = False,
 ) -> Recovery:
-    """Finish what killed monitors or renderers left in a directory.
+    """Finish the files that killed monitors or renderers left in a directory.
 
     Live videos get their final names, and metadata with `complete: false` and `reason:
-    "killed"`. Logs become trajectories with the same facts. Statistics and manifest are
-    written from the journal. Unfinished files of dead processes are removed. Deferred
-    videos stay pending: render them with `mjrec render DIR`. Files of open monitors and
-    running renderers are left alone. `docs/howto/recovery.md` has the details.
+    "killed"`. Logs become trajectories with the same facts. The statistics and manifest
+    are written from the journal. Unfinished files from dead processes are removed.
+    Deferred videos stay pending: run `mjrec render DIR`. Files of open monitors and
+    running renderers are left alone. See `docs/howto/recovery.md` for details.
 
-    It can be killed at any moment and repeated. A second run does nothing.
+    This function can be killed at any time and run again. A second run does nothing.
 
     Args:
         directory: the monitor directory.
         timeout: total number of seconds to wait for encoders that are still finishing
             a dead process's files.
-        bundle: put the trajectories from a monitor's logs into one file, as an
-            evaluation does.
+        bundle: whether to put the trajectories from a monitor's logs into one file, as
+            an evaluation does.
 
     Returns:
-        The finished files and the failures. A failure does not stop the rest.
+        The finished files and the failures. A failure does not affect other files.
 
     Raises:
         InvalidArgument: the directory does not exist, or `timeout` is invalid.
@@ -99,11 +99,11 @@ def recover(
     if not path.is_dir():
         raise InvalidArgument(f"Cannot recover {path}: it is not a directory.")
     dead, open_monitors = _dead_and_open(path)
-    # While another process recovers, it holds the locks of dead monitors, which then
-    # look open.
+    # While another process recovers the directory, it holds the locks of dead monitors,
+    # which then look open.
     if not (dead or stale_shared_files(path) or is_locked(path / _LOCK)):
         return Recovery(path, open_monitors=open_monitors)
-    # Not imported at the top: it loads HDF5, which a simulation that resumes after a
+    # Imported here because it loads HDF5, which a simulation that resumes after a
     # closed monitor does not need.
     from .killed_monitor import Report, finish_killed_monitor
 
@@ -114,7 +114,7 @@ def recover(
     while time.monotonic() < deadline and any(is_at_work(path, each) for each in dead):
         time.sleep(_MOMENT)
     with wait_for_lock(path / _LOCK):
-        # Look again, because another process may have recovered them meanwhile.
+        # Look again, because another process may have recovered them in the meantime.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
             finish_killed_monitor(path, infix, report, bundles=bundle)

@@ -37,10 +37,10 @@ def render(
 ) -> Iterator[Frame]:
     """Return the frames of a recorded episode, one at a time.
 
-    By default they are, byte for byte, the frames that `env.render()` returned, or
+    By default, the frames are byte-for-byte those that `env.render()` returned, or
     would have returned, on the same driver. Worker processes draw them until the
     iterator ends or is dropped. Only a few frames are in memory at a time. The first
-    one is drawn before this function returns.
+    frame is drawn before this function returns.
 
     ::
 
@@ -48,32 +48,32 @@ def render(
             ...
 
     Args:
-        trajectory: from `mjrec.load_trajectory`, or its path. If it was loaded with
-            `trust_models=True`, its compiled model is loaded too.
+        trajectory: a result of `mjrec.load_trajectory`, or a path. If it was loaded
+            with `trust_models=True`, its compiled model is loaded too.
         camera: name or number of one of the model's cameras, -1 for the free camera
             where the model places it, a `mujoco.MjvCamera`, or a mapping of its
             members. None means as recorded.
         width: width in pixels. None means as recorded.
         height: height in pixels. None means as recorded.
-        max_fps: draw only frames 0, n, 2n ... and the last, with at most this many per
-            second of simulated time. None draws all recorded frames.
+        max_fps: maximum frames per second of simulated time. Every n-th recorded frame
+            and the last frame are drawn. None draws all frames.
         quality: `"full"` or `"draft"` (no multisampling, shadow maps of at most
             1024x1024). None means as recorded.
-        workers: number of worker processes. The frames do not depend on it.
+        workers: number of worker processes. It does not affect the frames.
 
     Returns:
         New arrays, `(height, width, 3) uint8`, top row first.
 
     Raises:
         UnreadableFile: the trajectory or its model is missing, damaged, or from a
-            MuJoCo version that this one cannot read.
+            MuJoCo version that the installed one cannot read.
         UntrustedModel: another user or machine compiled the model, and its sources are
             missing.
         NoPictures: the trajectory has states but no snapshots.
         UnknownName: the camera or quality does not exist.
         InvalidArgument: another argument is invalid, or the driver cannot draw frames
             of this size.
-        GLError: no OpenGL backend works here.
+        GLError: no OpenGL backend works on this machine.
         Error: workers died twice at the same frame.
     """
     path = _path(trajectory)
@@ -104,12 +104,12 @@ def render_states(
     quality: str = "full",
     workers: int = 1,
 ) -> Iterator[Frame]:
-    """Return frames of physics states, one at a time.
+    """Return frames drawn from physics states, one at a time.
 
-    Each frame is the one that `mujoco.Renderer` draws of a new `MjData` after
-    `mj_setState` of the row and `mj_forward`. This lets you draw states from anywhere:
-    `mujoco.rollout`, MJX, Warp. Worker processes draw them, as in `render`. Until the
-    iterator ends or is dropped, the model and the states are in a temporary directory.
+    Each frame is what `mujoco.Renderer` draws for a new `MjData` after `mj_setState`
+    with the row and `mj_forward`. States can come from anywhere: `mujoco.rollout`, MJX,
+    Warp. Worker processes draw them, as in `render`. The model and the states stay in a
+    temporary directory until the iterator ends or is dropped.
 
     ::
 
@@ -122,7 +122,7 @@ def render_states(
 
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
-        states: `(n, size)`, a row per frame.
+        states: `(n, size)`, one row per frame.
         spec: the components of a row, a combination of `mujoco.mjtState` flags. All
             other components are as in a new `MjData`.
         height: height in pixels.
@@ -139,10 +139,10 @@ def render_states(
         InvalidArgument: the states have the wrong shape, or the size or camera is
             invalid.
         UnknownName: the camera or quality does not exist.
-        FileNotWritten: the disk of the temporary directory is full.
+        FileNotWritten: the disk with the temporary directory is full.
         GLError, Error: see `render`.
     """
-    # Imported here, because `render` needs no simulator in this process.
+    # Imported here because `render` needs no simulator in this process.
     from ..simulation.recorded_scene import check_states, save_states
 
     view = View(
@@ -176,7 +176,7 @@ def _started(
     begin: Callable[[], Iterator[Frame]],
     *resources: contextlib.AbstractContextManager[Any],
 ) -> Iterator[Frame]:
-    """Return an iterator that closes its workers and resources when it ends."""
+    """Return an iterator that closes its workers and resources at its end."""
 
     def frames() -> Iterator[Any]:
         with contextlib.ExitStack() as stack:

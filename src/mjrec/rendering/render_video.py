@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering the videos of one recording, with one file for each camera.
+"""Functions that render the videos of one recording, one for each camera.
 
 Frames arrive in order, whichever worker drew them, so the files do not depend on the
-number of workers. A video's metadata is written last: if it exists, the video is
-complete. The first camera's video is written after all others: if it exists, all do.
+number of workers. A video's metadata is written last, so if it exists, the video is
+complete. The first camera's video is written last, so if it exists, all videos do.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class _Shot:
 
     Attributes:
         path: the video's path.
-        view: its camera, size and quality.
+        view: the video's camera, size and quality.
         facts: the metadata that only this video has.
-        cameras: all cameras, if one video shows them side by side.
+        cameras: all cameras, if this video shows them side by side.
     """
 
     path: Path
@@ -76,18 +76,18 @@ def render_video(
 ) -> RenderedVideos:
     """Render the videos of a recording, with frame hashes and metadata.
 
-    If several cameras were recorded, each gets a video, or one video shows all side by
-    side. Files have temporary names until they are complete, and replace existing
-    files. If rendering fails or is interrupted, nothing is left behind. If the encoder
-    is killed or hangs, the video is tried a second time.
+    If several cameras were recorded, each gets a video, or a single video shows all of
+    them side by side. Files have temporary names until they are complete, and replace
+    existing files. If rendering fails or is interrupted, nothing is left behind. If the
+    encoder is killed or hangs, the video is rendered a second time.
 
     Args:
         parts: the trajectory of an episode, finished or not, or the parts of a clip.
-        variant: changes from the recording. If it names a camera, there is one video,
-            from that camera.
+        variant: changes from the recording. If it names a camera, only one video is
+            rendered, from that camera.
         workers: the workers that draw the frames.
-        out: the video of the first camera, or of all side by side. None means the name
-            in the recording, next to it.
+        out: the path for the video from the first camera, or from all cameras side by
+            side. None means the recorded name, next to the recording.
         strict: whether a blank video is listed in the result's `blank`. Otherwise there
             is only a warning.
         on_frame: called once for every frame of every video.
@@ -133,7 +133,7 @@ def render_video(
     }
     shots = _shots(parts[0], facts, variant.view, out)
     if out is None:
-        # Otherwise the second names would keep pointing to the replaced videos.
+        # Otherwise, the second names would still point to the replaced videos.
         take_second_names(shots[-1].path)
     sinks: list[VideoSink] = []
     videos: dict[str, int] = {}
@@ -162,7 +162,7 @@ def render_video(
 
 
 def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
-    """Write metadata that marks a recording's video as broken, without a video.
+    """Write metadata that marks a recording's missing video as broken.
 
     Raises:
         NoPictures: the reason is unknown, the recording has no video, or `out` is
@@ -185,9 +185,9 @@ def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
 def _runs(
     recorded: Recorded, indices: Sequence[int]
 ) -> Iterator[tuple[Path, list[int]]]:
-    """Yield each part with the numbers of its wanted frames, counted within the part.
+    """Yield each part with the indices of its selected frames, relative to the part.
 
-    Parts without wanted frames are left out.
+    Parts without selected frames are left out.
     """
     begin = 0
     for path, count in zip(recorded.parts, recorded.frame_counts, strict=True):
@@ -223,7 +223,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
         "content_type": "video/mp4",
         **recording_facts(first, recording="deferred"),
         "rendered_with": dict(versions()),
-        # Software rasterizers round as their CPU does.
+        # Software rasterizers round the way the CPU does.
         "machine": dict(machine_fingerprint()),
         "complete": complete,
         "length": last.get("length", recorded.step_count),
@@ -251,7 +251,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
 def _shots(
     recording: Path, facts: Mapping[str, Any], view: View, out: Path | None
 ) -> list[_Shot]:
-    """Return the videos to render; the first camera's comes last."""
+    """Return the videos to render, with the first camera's video last."""
     video = video_facts(facts)
     label = (facts.get("scene") or {}).get("label")
     further = list(video.get("cameras") or ())[1:]
@@ -265,7 +265,7 @@ def _shots(
         return {"also_named": name} if name else {}
 
     if video.get("tiled") and further:
-        # None draws the first camera as recorded, which its name alone cannot describe.
+        # None draws the first camera as recorded, which a name alone cannot describe.
         tiles = (None, *map(plain_camera, further))
         rows, columns = grid_shape(len(tiles))
         description = {"camera": [label, *further], "tiled": True, **second_name(first)}
@@ -293,7 +293,7 @@ def _film(
     draw: Callable[[], Iterable[tuple[Frame, Caption | None]]],
     on_frame: Callable[[], object],
 ) -> VideoSink:
-    """Write a video; retry once if the encoder was killed.
+    """Write a video, retrying once if the encoder was killed.
 
     Returns:
         The sink that wrote the video. The metadata is still missing.
@@ -310,7 +310,7 @@ def _film(
             sink.finish()
             break
         except BaseException as error:
-            # Half a video is useless, because all of it can be rendered again.
+            # Half a video is useless, because the whole video can be rendered again.
             sink.discard()
             # The encoder was killed, because memory ran out or because it hung.
             is_killed = isinstance(error, EncoderError) and (error.returncode or 0) < 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering a directory's pending videos, or rerendering recorded episodes."""
+"""Functions that render a directory's pending videos, or rerender episodes."""
 
 from __future__ import annotations
 
@@ -64,33 +64,33 @@ def render_videos(
     """Render the pending videos of a directory, or rerender recorded episodes.
 
     Without options, pending videos are rendered as planned. Several calls, in any
-    processes, share the work of a directory. With `camera`, `height`, `width`,
+    processes, share the work in a directory. With `camera`, `height`, `width`,
     `max_fps`, `quality`, `fps`, `annotate` or `out`, recorded episodes are rendered
-    again, into new files next to the originals.
+    again to new files next to the originals.
 
-    A failed video does not stop the others; the result contains the reasons. After
-    Ctrl-C or another exception, finished videos stay.
+    A failed video does not stop the others, and the result contains the reason. After
+    Ctrl-C or another exception, finished videos are kept.
 
     Args:
-        target: a monitor directory; or a trajectory or video in one, for that episode
-            only.
+        target: a monitor directory, or a trajectory or video in one to select only that
+            episode.
         episode: number of the episode. None means all recorded episodes.
         camera: see `mjrec.render`. None means as recorded, here and below.
         height: height in pixels.
         width: width in pixels.
-        max_fps: maximum frames per second of simulated time: every n-th recorded frame
-            and the last one are drawn.
+        max_fps: maximum frames per second of simulated time. Every n-th recorded frame
+            and the last frame are drawn.
         quality: `"full"` or `"draft"`.
-        fps: frames per second written into the file. It does not select frames.
-        annotate: write episode, step, time and return on the frames.
+        fps: frames per second of the file. This does not select frames.
+        annotate: whether to write the episode, step, time and return on the frames.
         out: the file to write, for one episode. Its suffix chooses the format.
         workers: number of worker processes. None means one per free CPU. If `engine`
             is a name, the number of engine workers.
-        strict: list videos that show nothing (black, one colour, no movement) in
-            `blank`. They are kept.
-        trust_models: load compiled models that another user or machine wrote. A crafted
-            model can run any code. Applies to the whole process during the call.
-        engine: where to render, if not in this process's own workers: an executor, or
+        strict: whether to list videos that show nothing (black, one color, no movement)
+            in `blank`. These videos are kept.
+        trust_models: whether to load compiled models from other users or machines. A
+            crafted model can run any code. This applies process-wide during the call.
+        engine: where to render, if not in this process's workers: an executor, or
             `"local"`, `"ray"` or `"slurm"`. One worker draws each video. All workers
             must see the directory under the same path.
         on_progress: called with the progress after every frame, or with an engine after
@@ -139,13 +139,13 @@ def iter_rendered_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> Iterator[RenderedVideos]:
-    """Do what `render_videos` does, but yield each result as soon as it exists.
+    """Work like `render_videos`, but yield each result as soon as it is available.
 
     Arguments are checked before the iterator is returned.
 
     Args:
         target: see `render_videos`.
-        variant: the changes from the recordings; if none, pending videos are rendered.
+        variant: changes from the recordings. Without any, pending videos are rendered.
         episode: see `render_videos`.
         out: see `render_videos`.
         workers: see `render_videos`.
@@ -167,7 +167,7 @@ def iter_rendered_videos(
         if not keys and not target.is_dir():
             raise InvalidArgument(
                 f"No video of {target.name} is pending: no recording has that name. To "
-                "render it again, say what should change (camera, size, max_fps, "
+                "render it again, specify what to change (camera, size, max_fps, "
                 "quality, fps, annotate) or where to write it (out, --out)."
             )
         results = finish(
@@ -224,7 +224,7 @@ def _recordings_of(
         numbers = sorted({key.number for key in keys if not key.is_clip})
         listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
         raise InvalidArgument(
-            f"{target} has no recorded states of episode {episode}. Available: "
+            f"{target} has no recorded states for episode {episode}. Available: "
             f"{listed}{' ...' * (len(numbers) > _SHOWN)}. Only episodes with a video "
             "keep their states, unless recorded with keep=, trajectory_callable= or "
             'mode="evaluation".'
@@ -240,7 +240,7 @@ def _variant_jobs(
     *,
     strict: bool,
 ) -> list[VideoJob]:
-    """Return the jobs that rerender episodes with changes.
+    """Return the jobs for rerendering episodes with changes.
 
     Raises:
         InvalidArgument: there are no trajectories, or `out` is given for several
@@ -260,9 +260,9 @@ def _variant_jobs(
     if out is not None:
         if len(names) > 1:
             raise InvalidArgument(
-                f"{out} is one file, but there are several episodes. Choose one."
+                f"{out} is one file, but there are several episodes. Select one."
             )
-        # With any suffix: the metadata file would have the name of the original's.
+        # Whatever the suffix, the metadata file would replace the original's.
         name = out.with_suffix(".mp4").name
         key = key_of(name)
         if key is not None and name == key.video_name:
@@ -283,12 +283,12 @@ def _variant_jobs(
 
 
 def name_of_variant(trajectory: str, variant: Variant) -> str:
-    """Return the name of a trajectory's video with changes.
+    """Return the name for a changed version of a trajectory's video.
 
-    It is the original's name with the changes before the extension, such as
+    The changes are inserted before the extension of the original name, as in
     `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera name that
-    could be mistaken for one of the other parts gets a prefix, as in `camera-draft`. A
-    camera without a name is given by a hash of its members. Readers of a directory
+    could be mistaken for one of the other parts gets a prefix, as in `camera-draft`.
+    For a camera without a name, a hash of its members is used. Readers of a directory
     never mistake the file for the original, and clearing the directory removes it.
     """
     view, parts = variant.view, []

@@ -16,7 +16,7 @@ the frames. The worker sends the bytes of frames, `(height, width, 3) uint8`, an
     {"log": ["mjrec.x", 30, "..."]}         for the parent's log
     {"untried": "..."}                      the test frame is wrong; the worker exits
 
-It ends when its parent does, even in the middle of a frame.
+The worker ends when its parent does, even in the middle of a frame.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _SECONDS_BETWEEN_LOOKS = 0.02
 class Drawing:
     """The frames of a scene, numbered from 0, which are drawn in ascending order.
 
-    A frame does not depend on which others were drawn before: the cameras are moved to
+    A frame does not depend on which frames were drawn before: the cameras are moved to
     where they would be if all earlier frames had been drawn.
 
     Args:
         scene: the scene to draw.
-        cameras: a renderer for each camera; several give a grid of frames. All use the
-            same canvas.
+        cameras: a renderer for each camera. Several renderers produce a grid of frames.
+            All use the same canvas.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class Drawing:
     ) -> None:
         self._scene = scene
         self._cameras = cameras
-        # The number of the frame that the renderers' cameras are at.
+        # The number of the frame that the renderers' cameras have reached.
         self._last = -1
         self._canvas_is_old = False
-        # Whether a frame can depend on the one before.
+        # Whether a frame can depend on the previous one.
         self._looks_back = not scene.is_constant or any(
             camera.shows_frame_before for camera in cameras
         )
@@ -131,7 +131,7 @@ def trajectory_drawing(
     """Return the frames that `env.render()` would have returned in a recorded episode.
 
     Args:
-        path: the trajectory; its model is expected next to it.
+        path: the trajectory. Its model is expected in the same directory.
         view: changes from the recording.
         cameras: the cameras to use in place of the view's; None in the list stands for
             the recorded camera. Each frame is then a grid of their frames.
@@ -142,7 +142,7 @@ def trajectory_drawing(
         NoPictures: the trajectory has no snapshots.
         UnknownName, InvalidArgument: the model lacks the camera, or the driver cannot
             draw frames of this size.
-        GLError: nothing can be drawn here.
+        GLError: nothing can be drawn on this machine.
     """
     reader = open_for_rendering(path, is_vetted=True)
     try:
@@ -159,7 +159,7 @@ def trajectory_drawing(
             "quality": view.quality or quality,
             "canvas": canvas or Canvas(),
         }
-        # For a camera as recorded, the recording contains how it moved.
+        # For a camera as recorded, the recording contains its movement.
         as_recorded = {
             "camera": recorded.camera,
             "begins_at": scene.previous_cameras,
@@ -179,7 +179,7 @@ def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
 
     Args:
         drawing: `trajectory` (a path) and, optionally, `cameras`; or `states` (a
-            directory written by `save_states`) and `spec`. In both cases also `view`.
+            directory written by `save_states`) and `spec`. Both contain `view`.
         canvas: the canvas to draw with.
 
     Raises:
@@ -191,7 +191,7 @@ def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
         path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
         return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
     scene = GivenStates(Path(drawing["states"]), drawing["spec"])
-    # For given states, no setting of the view is None.
+    # If states are given, no setting of the view is None.
     look: dict[str, Any] = vars(view)
     return Drawing(scene, [SceneRenderer(scene.model, canvas=canvas, **look)])
 
@@ -226,12 +226,12 @@ def main() -> None:
 
 
 def _prepare(drawing: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
-    """Load the model into the canvas, if it appears before there is more to do."""
+    """Load the model into the canvas, if it appears before the next message."""
     for _ in range(_LOOKS_FOR_RECORDING):
         if parent.has_said_something:
             return
-        # A recording exists from its first step on, its model a moment later. All other
-        # errors are reported when there is something to draw.
+        # A recording exists from its first step on, and its model a moment later. All
+        # other errors are reported when there is something to draw.
         with contextlib.suppress(Exception):
             open_drawing(drawing, canvas).close()
             return

@@ -37,12 +37,12 @@ class Episode:
         monitor: the infix of the monitor's files.
         video: the episode's video, if it has one.
         metadata: the video's metadata, if there is a video.
-        trajectory: the episode's trajectory, if it has one. The file may not exist yet:
-            `load_trajectory` then reads the monitor's log.
+        trajectory: the episode's trajectory, if it has one. If the file does not exist
+            yet, `load_trajectory` reads the monitor's log.
         pending: whether the video must still be rendered (`mjrec render`).
         success: whether the environment reported success.
-        evaluation: for an episode of an evaluation, its `seed`, its number there
-            (`episode`), and MuJoCo's `warnings`.
+        evaluation: for an episode of an evaluation, its `seed`, its number in the
+            evaluation (`episode`), and MuJoCo's `warnings`.
     """
 
     episode_id: int
@@ -64,7 +64,7 @@ class Episode:
     evaluation: Mapping[str, Any] | None = None
 
     def _repr_html_(self) -> str:
-        """Show the episode in a notebook: its numbers and its video."""
+        """Show the episode's numbers and video in a notebook."""
         ended = "terminated" if self.terminated else "truncated"
         facts = {
             "steps": self.length,
@@ -84,18 +84,18 @@ def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
 
     Monitors are ordered by infix, and their episodes by end time. Monitors that never
     closed are read from their journals. Episodes are read one by one, so memory use
-    does not grow.
+    stays constant.
 
     If a journal lacks episodes that the statistics file has, the statistics file is
     used, with details from the journal. Damaged lines in a journal are skipped with a
     warning.
 
-    If an environment was reset twice in a row, gym's files do not say which video
-    belongs to which episode; these episodes have no video. Episodes whose journal line
+    If an environment was reset twice in a row, gym's files do not show which video
+    belongs to which episode. Such episodes have no video. Episodes whose journal line
     is lost have no video either, and get the lowest possible number.
 
     Raises:
-        UnreadableFile: the directory does not exist (raised at once), or a file is
+        UnreadableFile: the directory does not exist (raised immediately), or a file is
             damaged and no other file has the same episodes (raised during iteration).
     """
     directory = Path(directory)
@@ -139,13 +139,13 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
 
 
 def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
-    """Return whether all episodes were completed, so that numbers have no gaps."""
+    """Return whether all episodes were completed, so that the numbers have no gaps."""
     count, following = len(stats.timestamps), results.details.get("next_episode_id")
     if results.details:
         return following is not None and following - first == count
-    # gym noted a type at each reset, and numbered videos by resets. One more type than
-    # episodes means that the last episode is unfinished; two more mean two resets in a
-    # row.
+    # gym recorded a type at each reset, and numbered videos by resets. One more type
+    # than episodes means that the last episode is unfinished; two more mean two resets
+    # in a row.
     return len(stats.episode_types or ()) <= count + 1
 
 

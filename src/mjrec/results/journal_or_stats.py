@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A monitor's results, read from its journal or from its statistics file.
 
-A monitor writes each episode twice: to its journal when the episode ends, and to the
-statistics file that its manifest names when the monitor closes (or at each reset). A
-killed monitor leaves only a journal, or a journal and an older manifest. The file with
-more episodes is used; episodes are never taken from both.
+A monitor writes each episode twice: to its journal when the episode ends, and to its
+statistics file when the monitor closes (or at each reset). A killed monitor leaves only
+a journal, or a journal and an older manifest. The file with more episodes is used;
+episodes are never taken from both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
 
-# A lock contains one line. This limits how much of a planted file is read.
+# A lock contains one line. This limits how much of a forged file is read.
 _LONGEST_LOCK = 1 << 16
 
 
@@ -38,7 +38,7 @@ class MonitorResults:
     """The results of one monitor, as far as its files can be read.
 
     The journal replaces a damaged or missing manifest or statistics file, and vice
-    versa. A warning in the log names the damaged file.
+    versa. A logged warning names the damaged file.
 
     Args:
         files: the monitor's files.
@@ -65,7 +65,7 @@ class MonitorResults:
         """The content of the statistics file, or None if it is missing or damaged.
 
         Raises:
-            UnreadableFile: the file is damaged, or missing although a manifest names
+            UnreadableFile: the file is damaged, or is missing although a manifest names
                 it, and the journal is missing too.
         """
         path = self.files.stats
@@ -105,13 +105,13 @@ class MonitorResults:
 
     @property
     def details(self) -> Mapping[str, Any]:
-        """The facts that this package adds to a manifest; empty if it is missing."""
+        """The facts that this package adds to a manifest; empty if there are none."""
         manifest = self.manifest
         return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
 
     @property
     def env_info(self) -> Mapping[str, Any] | None:
-        """The environment in the manifest, journal or lock; None if unknown."""
+        """The environment's facts in the manifest, journal or lock; None if unknown."""
         with contextlib.suppress(UnreadableFile):
             if self.manifest is not None:
                 return self.manifest.env_info
@@ -136,10 +136,10 @@ class MonitorResults:
         return saved is None or self.run.count > len(saved.timestamps)
 
     def stats(self) -> StatsFile:
-        """Return the statistics from the journal or the file, whichever has more.
+        """Return the statistics from the journal or the file with more episodes.
 
         Raises:
-            UnreadableFile: neither can be read.
+            UnreadableFile: neither file can be read.
         """
         saved, journal = self.saved, self.files.journal
         if journal is not None and self.is_behind:
@@ -167,7 +167,7 @@ def locked_run(path: Path) -> Mapping[str, Any]:
     Raises:
         OSError, ValueError: the lock cannot be read.
     """
-    # A lock is empty for a moment after it is created. Links are not followed.
+    # A lock file is briefly empty after it is created. Links are not followed.
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")
@@ -177,7 +177,7 @@ def locked_run(path: Path) -> Mapping[str, Any]:
 
 
 def _stats_of(entries: list[JournalEntry], saved: StatsFile | None) -> StatsFile:
-    """Return the statistics of a journal's episodes."""
+    """Return the statistics about a journal's episodes."""
     # Prefer the saved time, because the first episode may never have ended.
     start = None if saved is None else saved.initial_reset_timestamp
     if start is None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that write statistics files and manifests from a monitor's other files.
 
-In a monitor directory, only this module writes them, and only if their content changes,
-at these moments:
+In a monitor directory, only this module writes these files, only if their content
+changes, and only at the following times:
 
 - A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
 - A process has rendered pending videos (`rendering.finish`).
@@ -72,7 +72,7 @@ class Written:
         stats: the current statistics; None if they cannot be recovered.
         is_new_manifest: whether the manifest had to be written.
         is_new_stats: whether the statistics had to be written; always False for a
-            monitor, which passes its own statistics.
+            monitor, because it passes its own statistics.
     """
 
     manifest: Manifest
@@ -90,7 +90,7 @@ def update_manifests(directory: Path) -> None:
     """Update the manifests of closed monitors that list pending videos.
 
     Raises:
-        UnreadableFile: a manifest is damaged; the others are updated.
+        UnreadableFile: a manifest is damaged. The other manifests are updated.
         DirectoryNotWritable: no lock can be created in the directory.
         FileNotWritten: the disk is full; existing manifests are unchanged.
     """
@@ -137,7 +137,7 @@ def write_manifest_and_stats(
     """
     name = f"{stats_prefix(infix)}.stats.json"
     if run is not None and stats is not None:
-        # Written first, because it reveals a full disk or a missing directory.
+        # Write this file first: it reveals a full disk or a missing directory.
         write_stats_file(directory / name, stats)
     # While a monitor is open, no other process writes these files.
     with contextlib.nullcontext() if run else manifest_lock(directory, infix):
@@ -226,7 +226,7 @@ def finished_and_broken(
     """Return finished videos with their metadata, and the metadata of broken videos.
 
     Videos from additional cameras exist once the first camera's video does, because its
-    metadata is written last. A vector environment's tiled video is independent of that.
+    metadata is written last. A vector environment's tiled video exists independently.
     """
     names = {f"{video_prefix(infix, number)}.mp4" for number in run.filmed}
     finished: set[tuple[str, str]] = set()

@@ -30,8 +30,8 @@ class MergedStats(NamedTuple):
     """The episodes of several statistics files, ordered by end time.
 
     Attributes:
-        data_sources: index of each episode's file, which is also an index into
-            `initial_reset_timestamps`.
+        data_sources: index of the file that contains each episode, which is also an
+            index into `initial_reset_timestamps`.
         initial_reset_timestamps: start time of each file's first reset; None if there
             was no reset.
         timestamps: end time of each episode.
@@ -62,9 +62,9 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     contains pairs of video path and metadata path.
 
     For a monitor that never closed (killed, or still open), the episodes in its journal
-    are used if there are more than in its statistics file. If its manifest is missing,
-    `manifests` lists the journal's path instead, and `videos` lists the videos on disk
-    that are not broken. Damaged lines in a journal are skipped with a warning.
+    are used if there are more of them than in its statistics file. If its manifest is
+    missing, `manifests` lists the journal's path instead, and `videos` lists the videos
+    on disk that are not broken. Damaged lines in a journal are skipped with a warning.
 
     If monitors recorded different environments or versions, a warning is logged, and
     `env_info` comes from the newest monitor. Missing videos are left out with a
@@ -90,7 +90,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     if not kept:
         logger.error("There are no manifests or journals in %s.", directory)
         return None
-    # In the order of the manifests' names, as in gym.
+    # Sort by the names of the manifests, as gym does.
     kept.sort(key=lambda each: f"{each.infix}.manifest.json")
     found = {
         "manifests": [each.path for each in kept],
@@ -111,7 +111,7 @@ def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
 
 
 class _Kept(NamedTuple):
-    """The part of a monitor's results that is kept in memory while merging."""
+    """The part of a monitor's results that is kept in memory during merging."""
 
     infix: str
     path: str
@@ -154,8 +154,8 @@ def _merge(files: Sequence[StatsFile]) -> MergedStats:
 
 
 def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
-    # In files without types, every episode is a training episode. gym noted a type at
-    # each reset, even for episodes that never ended, so there may be too many types.
+    # In files without types, every episode is a training episode. gym recorded a type
+    # at each reset, even for episodes that never ended, so there may be too many types.
     types = (
         itertools.repeat("t") if stats.episode_types is None else stats.episode_types
     )
@@ -213,7 +213,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
-    """Return the videos in the manifest, or those on disk if it is outdated."""
+    """Return the manifest's videos, or those on disk if the manifest is outdated."""
     manifest, journal = results.manifest, results.files.journal
     if manifest is not None and not results.is_behind:
         return list(dict.fromkeys(manifest.videos))

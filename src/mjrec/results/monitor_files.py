@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that find, sort and remove a directory's files, monitor by monitor."""
+"""Functions that find, sort and remove the files in a directory by monitor."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class MonitorFiles:
         manifest: the manifest, if it exists.
         stats: the statistics file, if it exists.
         journal: the journal, if it exists.
-        lock: the lock that claims the infix, if it exists; a killed monitor leaves one.
+        lock: the lock that claims the infix, if it exists. Killed monitors leave one.
         videos: the videos, by episode number.
         metadata: the videos' metadata, by episode number.
         trajectories: the trajectories, by episode number, including those that are in
             flight or in a bundle.
-        logs: the row logs; a log is included as long as one of its files remains.
+        logs: the row logs. A log is included as long as one of its files remains.
         last_episode_id: the highest episode number in a file name, including unfinished
             files; -1 if there is none.
     """
@@ -133,8 +133,8 @@ def monitors_of(directory: Path) -> Iterator[MonitorFiles]:
 
 def files_of(directory: Path, infix: str) -> MonitorFiles:
     """Return the current files of one monitor, including hidden ones."""
-    # Test for the infix first, because all names in the directory are compared again
-    # for each dead monitor.
+    # Test for the infix first, because all names in the directory are compared for each
+    # dead monitor.
     own = f".{infix}."
     names = [n for n in names_in(directory) if own in n and infix_of(n) == infix]
     paths = [path for n in sorted(names) if (path := directory / n).is_file()]
@@ -155,7 +155,7 @@ def detect_training_manifests(
 ) -> list[str]:
     """Return the paths of the manifests in `directory`, sorted.
 
-    Unfinished files and files with similar names are left out. For a missing directory
+    Unfinished files and files with similar names are left out. For a missing directory,
     the list is empty.
 
     Args:
@@ -183,7 +183,7 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
     other files with similar names are kept.
 
     Raises:
-        DirectoryInUse: a monitor in the directory is open; nothing was removed.
+        DirectoryInUse: a monitor in the directory is open. Nothing was removed.
     """
     paths = list(iter_monitor_files(Path(directory), hidden=True))
     for path in paths:

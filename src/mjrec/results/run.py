@@ -2,8 +2,8 @@
 """The state of a run, built from the events in its journal.
 
 The monitor adds each event to its `Run` when it writes the event to the journal, and
-other processes read the same events from the journal. So results and manifests are
-based on the same facts, whether they are created during the run or years later.
+other processes read the same events from the journal. Therefore, results and manifests
+are based on the same facts, whether they are created during the run or years later.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..formats.json_fields import base_name
 from ..formats.manifest import Manifest
 from ..formats.monitor_directory import episode_of
 
-# The `scope` of a choice among the episodes of several monitors.
+# The `scope` of a choice from the episodes of several monitors.
 EVALUATION = "evaluation"
 
 
@@ -31,12 +31,12 @@ class Run:
     Attributes:
         facts: the facts in the journal's first line: `env_info`, `schedule` (its name),
             `keep` (`rule`), `first_episode_id`, `versions`, and `views` (the parts
-            before the ending in the names of additional cameras' videos).
+            before the extension in the names of additional cameras' videos).
         provenance: the run's provenance; None if unknown.
         count: number of completed episodes.
-        last_episode_id: the highest number of a started episode; -1 if there is none.
+        last_episode_id: the highest number of any episode that began; -1 if none did.
         chosen: the episodes that the schedule chose.
-        filmed: the episodes that have, or will have, their own video.
+        filmed: the episodes that have, or will have, a video of their own.
         deferred: the filmed episodes whose video is rendered from their states.
         clips: the clips, by video name. For a clip that must be rendered, `clip` is the
             name of its first part.
@@ -115,7 +115,7 @@ class Run:
         return self.deferred - self.dropped
 
     def begin(self, number: int, *, chosen: bool) -> None:
-        """Add a started episode, which the journal lists only when it ends."""
+        """Add an episode that has begun. The journal lists it only when it ends."""
         self._add(number, chosen, None)
 
     def add(self, entry: JournalEntry) -> None:
