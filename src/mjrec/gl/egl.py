@@ -51,7 +51,7 @@ def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
     The result is empty if EGL is not installed or cannot list its devices.
 
     Args:
-        with_cuda: whether to ask for CUDA's numbers. The driver then initializes CUDA,
+        with_cuda: whether to query CUDA's numbers. The driver then initializes CUDA,
             so processes that are forked afterwards can no longer use CUDA.
     """
     try:
