@@ -70,7 +70,7 @@ def trajectory_in(target: Path, episode: int | None) -> Path:
     if not those:
         known = sorted({str(episode_of(path.name)) for path in found}, key=int)
         raise InvalidArgument(
-            f"{target} has no recorded states for episode {episode}. Recorded episodes: "
+            f"{target} has no recorded states for episode {episode}. Available: "
             f"{', '.join(known[:_SHOWN])}{' ...' if len(known) > _SHOWN else ''}."
         )
     if len(those) > 1:
