@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recreation of the choice among the episodes of an evaluation.
+"""Recreation of an evaluation's choice of episodes.
 
 An evaluation chooses its videos from the episodes of all recordings of an environment.
 If the archive contains all of these, the rule is applied again. If some are missing, or
@@ -46,7 +46,7 @@ def choose_for_evaluations(
         recordings: the inputs of all recordings.
         directory: the directory of the recreated recordings. Their monitors must be
             closed.
-        notes: receives the choices that are believed.
+        notes: receives notes on the choices that are believed.
     """
     groups: dict[str, list[RecordingInputs]] = {}
     for each in recordings:

@@ -190,7 +190,7 @@ class RecordingInputs:
 
     @property
     def failed(self) -> Sequence[Mapping[str, Any]]:
-        """The facts about each of an evaluation's episodes that failed."""
+        """The facts about each failed episode of an evaluation."""
         events = self.evaluation_events
         return [facts for kind, facts in events if kind == "failed" and facts]
 
@@ -233,7 +233,7 @@ class Inputs:
 
         Args:
             folder: an empty folder.
-            arrays: the arrays that the episodes name.
+            arrays: the arrays that the episodes refer to.
         """
         text = json_text.dumps(to_json(self))
         (folder / INPUTS_FILE).write_text(text)

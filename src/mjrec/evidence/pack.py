@@ -2,8 +2,8 @@
 """Packing a monitor directory into one zip file that can be verified.
 
 The archive is built in a hidden folder next to its final path. Files are hard-linked
-into the folder if possible, so that a run of many gigabytes needs little space. Nothing
-in it is written in place: a changed file is written under a temporary name and renamed.
+into the folder if possible, so that a run of many gigabytes needs little space. They
+are never changed in place: a new version is written to a temporary file and renamed.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def pack(
             evaluation's. Its monitors must be closed and its videos rendered.
         path: the archive, a new file that ends in `.zip`.
         title: the run's title. None generates one from the recorded environments.
-        authors: each "Name", "Name <address>" or "Name <ORCID>".
-        license: SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
+        authors: each in the form "Name", "Name <address>" or "Name <ORCID>".
+        license: SPDX identifier of the license, such as "CC-BY-4.0", or its URL.
         episodes: numbers of the episodes whose videos and states are packed. None means
             all, and must be used for a folder of several directories. The statistics,
             actions and seeds of all episodes are packed in any case, and the archive

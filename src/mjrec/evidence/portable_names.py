@@ -35,7 +35,7 @@ def portable_parts(name: str) -> tuple[str, ...]:
 
 
 def check_distinct(names: Iterable[str]) -> None:
-    """Check that no two names are one file, or one file and folder, on any system.
+    """Check that no two names clash on any system, as files or as file and folder.
 
     Some systems do not distinguish upper case from lower case, or composed from
     decomposed accents.

@@ -156,7 +156,7 @@ def _run_all(
         on_progress: called with the progress.
 
     Returns:
-        What they sent: `findings`, `excuses`, `inputs` and `facts`.
+        The values that the processes sent: `findings`, `excuses`, `inputs` and `facts`.
     """
     heard: dict[str, Any] = {"findings": [], "excuses": [], "inputs": {}, "facts": {}}
     stages = {
@@ -191,7 +191,7 @@ def _run(
     heard: dict[str, Any],
     on_progress: Callable[[VerificationProgress], object] | None,
 ) -> str | None:
-    """Run a process and add what it sends to `heard`; return why it failed, or None."""
+    """Run a process and add its messages to `heard`; return the reason if it failed."""
     told = on_progress or (lambda _: None)
     began, failure = time.monotonic(), None
 
@@ -259,7 +259,7 @@ def _working_folder() -> Iterator[Path]:
     """
     parent = Path(tempfile.gettempdir())
     for folder in parent.glob(f"{_PREFIX}*"):
-        # Ignore folders that disappear meanwhile or cannot be read.
+        # Ignore folders that disappear in the meantime or cannot be read.
         with contextlib.suppress(OSError):
             if _is_abandoned(folder):
                 shutil.rmtree(folder, ignore_errors=True)
