@@ -360,7 +360,7 @@ class IdentityLeft(PackError):
     """The archive would still name a person or machine despite `anonymous=True`.
 
     Attributes:
-        found: pairs of a file and what was found in it.
+        found: pairs of a file and the name found in it.
     """
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
@@ -418,10 +418,10 @@ class MissingDependency(Error, ImportError):
     """An optional package or program is needed, but missing or unusable.
 
     Args:
-        package: its name.
-        purpose: what needs it.
+        package: the dependency's name.
+        purpose: the feature that needs it.
         install: the command that installs it.
-        reason: what is wrong with it; None if it is not installed.
+        reason: why it is unusable; None if it is not installed.
     """
 
     def __init__(

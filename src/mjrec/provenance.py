@@ -90,7 +90,7 @@ class Provenance:
         """Return the provenance, or None if it has not been collected.
 
         Args:
-            wait: whether to wait for up to two seconds until it is collected.
+            wait: whether to wait up to two seconds for it to be collected.
 
         Returns:
             None if it is not ready or could not be collected. Otherwise `command`,

@@ -98,7 +98,7 @@ def record_session(
     """Record a session, and yield each episode as it ends.
 
     If the environment cannot be rendered here, only statistics are recorded, and the
-    log says why. If `render` requests videos, an error is raised instead.
+    log gives the reason. If `render` requests videos, an error is raised instead.
 
     The recordings are closed when the iterator ends, is closed, or raises. So make sure
     to close the iterator, preferably with `contextlib.closing`. The iterator waits

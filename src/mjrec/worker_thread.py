@@ -25,7 +25,7 @@ class WorkerThread(Generic[T]):
     Args:
         consume: called with each item, always on the same thread.
         capacity: maximum number of waiting items.
-        name: the thread's purpose, to which `mjrec-` is prefixed to form its name.
+        name: the thread's purpose; the thread's name is this with the prefix `mjrec-`.
         finish: called on the thread after the last item, but not after an error or
             `abort`.
 

@@ -102,8 +102,8 @@ def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
     """Return the arguments, the first of which is a command.
 
     Raises:
-        SystemExit: the command is unknown, it or its arguments are missing, or help or
-            the version was requested. A message has been printed.
+        SystemExit: the command is unknown or missing, its arguments are missing, or
+            help or the version was requested. A message has been printed.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if not given:

@@ -47,10 +47,10 @@ def compare(
     (mjrec compare A... --against B...). With several, each evaluation counts as one
     training run, represented by its mean return.
 
-    For each common task, the output has both means, their difference B - A, the
+    For each common task, the output shows both means, their difference B - A, the
     probability of improvement (B's return is higher than A's), and the p-value of the
-    Mann-Whitney test, adjusted for the number of tasks (Holm). Across tasks, it has the
-    mean probability of improvement and the difference of the scores' IQMs.
+    Mann-Whitney test, adjusted for the number of tasks (Holm). Across tasks, it
+    shows the mean probability of improvement and the difference between the IQMs.
 
     The exit status is 1 if a task cannot be compared (no completed episode, or NaN), or
     if a requirement of --require or --no-worse-than is not met. With either option, it
@@ -76,8 +76,8 @@ def compare(
     if not against:
         if len(a) != 2:
             raise InvalidArgument(
-                "Give two evaluations (mjrec compare A B) or two sets (mjrec compare "
-                f"A... --against B...); got {len(a)} without --against."
+                "Give two evaluations (mjrec compare A B), or two sets of evaluations "
+                f"(mjrec compare A... --against B...), not {len(a)} without --against."
             )
         a, against = a[:1], a[1:]
     if (no_worse_than is None) != (margin is None):

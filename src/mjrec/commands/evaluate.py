@@ -99,8 +99,8 @@ def evaluate(
             this number. With --engine, the number of engine workers.
         seeds: the seeds, such as 0,1,2 or 0-99, instead of --num-seeds.
         keep: which episodes of each task get a video: best, best:N, median, worst,
-            worst:N, failures, failures:N, joined by commas; or cubic, all or none. By
-            default best,median,worst.
+            worst:N, failures, failures:N, joined by commas; or cubic, all or none.
+            Default: best,median,worst.
         protocol: with seeded, episode i of seed s starts from NumPy's SeedSequence([s,
             i]); with suite, each task and seed has one random stream, seeded with s.
             Default: seeded.
@@ -119,13 +119,13 @@ def evaluate(
         env_kwargs: arguments for each environment, as a JSON object.
         policy_kwargs: arguments for the policy, as a JSON object.
         score_range: TASK=LOW:HIGH, the returns that count as scores of 0 and 1 across
-            tasks. dm_control tasks have their own. May be repeated.
+            tasks. dm_control tasks have known ranges. May be repeated.
         fail_under: TASK=VALUE: exit with status 1 if the task's mean return is lower or
             one of its episodes failed. TASK may be a pattern. May be repeated.
         allow_nan: do not exit with status 1 because of NaN or infinite returns.
         confidence: confidence level of the intervals.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where episodes and videos are computed, if not in this command's
+        engine_options: where to compute episodes and videos, if not in this command's
             own processes.
     """
     height, width = size_of(size)

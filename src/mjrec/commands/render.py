@@ -80,7 +80,7 @@ def render(
             if their sources are missing. A crafted model can run any code, so
             use it only if you trust the author.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where the work runs, if not in this command's own processes.
+        engine_options: where to run the work, if not in this command's own processes.
     """
     height, width = size_of(size)
     if annotate and no_annotate:
@@ -98,12 +98,12 @@ def render(
     if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
             "--pending renders videos as planned. To render an episode differently, "
-            "omit it."
+            "omit --pending."
         )
     places, number = _places(target, episode)
     if out is not None and len(places) > 1:
         raise InvalidArgument(
-            f"--out is for one episode, and {target} has several: name its trajectory "
+            f"--out is for one episode, but {target} has several. Give a trajectory "
             "(openaigym.trajectory.*.h5)."
         )
     engine = engine_options.chosen(workers)

@@ -131,14 +131,14 @@ class _Texts:
         return self._matcher.replaced_in_name(self._with_new_infixes(name))
 
     def text(self, text: str) -> str:
-        """Return a string without the identity."""
+        """Return a string with the identity removed."""
         is_of_monitor = text.startswith(f"{FILE_PREFIX}.")
         if is_second_name(text) or (is_of_monitor and not re.search(r"[/\s]", text)):
             return self.name(text)
         return self._matcher.replaced(self._with_new_infixes(text))
 
     def value(self, value: Any) -> Any:
-        """Return a JSON value without the identity."""
+        """Return a JSON value with the identity removed."""
         match value:
             case str():
                 return self.text(value)
@@ -153,7 +153,7 @@ class _Texts:
                 return value
 
     def json(self, data: bytes) -> bytes:
-        """Return JSON without the identity; the same bytes if nothing changes."""
+        """Return JSON with the identity removed; the same bytes if nothing changes."""
         value = loads(data)
         new = self.value(value)
         return data if new == value else dumps(new).encode()
@@ -253,7 +253,7 @@ def _without_directories(argument: Any) -> Any:
 
 
 def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str, str]:
-    """Return the new infixes of monitors whose old ones contain the identity."""
+    """Return the new infixes of monitors whose old infixes contain the identity."""
     old = sorted({infix for name in names if (infix := infix_of(name)) is not None})
     taken = {infix for infix in old if matcher.replaced_in_name(infix) == infix}
     new: dict[str, str] = {}

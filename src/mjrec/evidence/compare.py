@@ -267,7 +267,7 @@ class Comparison:
         yield Same(Topic.FILES)
 
     def _not_compared(self) -> Iterator[Same | Difference | Finding]:
-        """Yield what this level leaves unchecked, and compare the sampled frames."""
+        """Yield the items that this level skips, and compare the sampled frames."""
         videos = sorted((self._given / RECORDINGS).glob("*.mp4"))
         frames = drawn = 0
         for path in videos:

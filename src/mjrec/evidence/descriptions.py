@@ -82,12 +82,12 @@ def descriptions(
 ) -> dict[str, str]:
     """Return the contents of all descriptions, keyed by file name.
 
-    They depend only on the recordings and the arguments.
+    The descriptions depend only on the recordings and the arguments.
 
     Args:
         run: the packed run to describe.
         recordings: the folder of the packed recordings.
-        packed_with: the versions of the software that packs it.
+        packed_with: the versions of the software that packs the run.
 
     Raises:
         UnreadableFile: a file is damaged.
@@ -148,7 +148,7 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
     """Return the content of `environment.json`.
 
     Returns:
-        `recordings`: for each monitor, by its infix, `env_id`, `versions`, `provenance`
+        `recordings`: for each infix of a monitor, `env_id`, `versions`, `provenance`
         (null if not recorded), and `pictures` and `encoders`, the distinct renderers
         and encoders of its videos. `packed_with`: the versions of the software that
         packed the archive, and the packing options.

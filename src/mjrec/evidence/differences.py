@@ -22,7 +22,7 @@ _VIDEO_OR_TRAJECTORY: Final = re.compile(r"openaigym\.(video|trajectory)\.")
 
 
 class Aspect(enum.Enum):
-    """How an item differs, which determines what may excuse it.
+    """How an item differs, which determines the excuses that may apply.
 
     Attributes:
         EXACT: values that must be equal; no version or machine changes them.
@@ -116,8 +116,8 @@ class Difference(Place):
         size: the largest `abs(x - y) / (1 + abs(x))` for numbers. None if the
             difference has no size.
         claim: the name of the excuse for a CLAIM: "mujoco", "gl", "ffmpeg", "machine".
-        figures: further numbers, keyed by name, such as `psnr`, `ssim` and `block` for
-            PICTURE.
+        figures: additional numbers, keyed by name, such as `psnr`, `ssim` and `block`
+            for PICTURE.
     """
 
     aspect: Aspect = Aspect.EXACT
@@ -151,7 +151,7 @@ STORED_DIFFERENTLY: Final = Difference(
 
 
 def only_in(is_given: bool, value: Any) -> str:
-    """Return a clause that says which one of the two runs has a value."""
+    """Return a clause that says which of the two runs has a value."""
     who = "the archive" if is_given else "the recreated run"
     return f"only {who} has it: {short(value)}"
 

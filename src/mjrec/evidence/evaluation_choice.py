@@ -103,7 +103,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
 def _made_again(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
-    """Return the episodes that the rule chooses from the replayed ones."""
+    """Return the episodes that the rule chooses from all replayed episodes."""
     ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
         for facts in recording.failed:

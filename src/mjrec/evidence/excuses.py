@@ -257,7 +257,7 @@ def _merged(same: list[Excuse]) -> Excuse:
 
 
 def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Drop excuses that need two major versions of MuJoCo where there is only one."""
+    """Drop excuses that need two major MuJoCo versions if only one was used."""
     known = tuple(excuses)
     others = {
         item

@@ -86,7 +86,7 @@ class Limits:
     shadow: float = 0.0
 
     def strain(self, found: Similarity) -> float:
-        """Return the difference as a fraction of what is allowed; above 1 fails."""
+        """Return the difference as a fraction of the limits; more than 1 fails."""
         noise = 10 ** ((self.psnr - found.psnr) / 20)
         return max(noise, (1 - found.ssim) / (1 - self.ssim), found.block / self.block)
 
@@ -121,7 +121,7 @@ OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0, shadow=0.04)
 def planes_of(frame: Frame) -> Planes:
     """Return the planes of a rendered frame, padded to an even width and height.
 
-    They match the planes passed to the encoder to within one level.
+    The result matches the planes passed to the encoder to within one level.
     """
     rgb = pad_to_even(frame).astype(np.float32) / 255
     luma = rgb @ _LUMA

@@ -62,7 +62,7 @@ class Identity:
         homes: absolute paths of home directories.
         directories: absolute paths of the user's work: working directories, roots of
             repositories, directories of policies and programs.
-        remotes: URLs of git repositories, and their `owner/name`.
+        remotes: URLs of git repositories, and the `owner/name` in them.
     """
 
     users: set[str] = field(default_factory=set)

@@ -150,7 +150,7 @@ class RecordingInputs:
         episodes: the episodes, in order.
         evaluation_events: the journal's events ("begun" or "failed") about episodes of
             an evaluation, each as its kind and facts, in the journal's order.
-        evaluation_keeps: the facts of each choice among all recordings of an
+        evaluation_keeps: the facts about each choice among all recordings of an
             evaluation.
         faults: for each fault of the recorder, the number of journal lines before it
             (not counting the first) and its facts.
@@ -160,7 +160,7 @@ class RecordingInputs:
         provenance_after: number of lines in the journal before the provenance, not
             counting the first.
         was_killed: whether another process recovered the recording.
-        has_sources: whether its models' sources had been stored when it was killed.
+        has_sources: whether the models' sources had been stored when it was killed.
     """
 
     infix: str

@@ -392,7 +392,7 @@ def _exception_kind(name: str) -> type[BaseException]:
 
 
 def _unpack_sources(path: Path, into: Path) -> tuple[Path, Any]:
-    """Unpack an MJCF file and the files that it refers to; return it and its model.
+    """Unpack an MJCF file and the files that it refers to; return its path and model.
 
     Args:
         path: the zip file that a recorder wrote.

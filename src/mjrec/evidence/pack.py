@@ -72,16 +72,16 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory, or a folder of several, such as an
+        directory: the monitor directory, or a folder with several, such as an
             evaluation's. Its monitors must be closed and its videos rendered.
         path: the archive, a new file that ends in `.zip`.
         title: the run's title. None generates one from the recorded environments.
         authors: each in the form "Name", "Name <address>" or "Name <ORCID>".
         license: SPDX identifier of the license, such as "CC-BY-4.0", or its URL.
         episodes: numbers of the episodes whose videos and states are packed. None means
-            all, and must be used for a folder of several directories. The statistics,
-            actions and seeds of all episodes are packed in any case, and the archive
-            records the choice.
+            all, and must be used for a folder with several directories. The statistics,
+            actions and seeds of all episodes are always packed, and the archive records
+            the choice.
         anonymous: remove everything that names a user, a machine or an author, for
             blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
@@ -150,9 +150,9 @@ def pack(
 
 
 def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
-    """Pack a monitor directory into a new folder, with the content of an archive.
+    """Pack a monitor directory into a new folder, with the same content as an archive.
 
-    If the archive is anonymous, no names are searched for, because the recordings
+    If the archive is anonymous, names are not searched for, because the recordings
     contain none.
 
     Raises:
@@ -262,7 +262,7 @@ def _folder_beside(archive: Path) -> Iterator[Path]:
 
 
 def _publish(finished: Path, path: Path) -> None:
-    """Give a finished archive its name without replacing a file."""
+    """Give a finished archive its final name without replacing an existing file."""
     try:
         path.hardlink_to(finished)
     except FileExistsError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of files in an archive that mean the same thing wherever it is unpacked.
+"""File names that mean the same thing wherever their archive is unpacked.
 
 On every system, such a name refers to a file below the folder that the archive is
 unpacked into, and two different names refer to two different files.

@@ -378,7 +378,7 @@ def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return the values of known keys; the others cannot be recreated."""
+    """Return the values of known keys; other values cannot be recreated."""
     return {key: value for key, value in said.items() if key in keys}
 
 

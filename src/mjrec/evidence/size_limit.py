@@ -91,7 +91,7 @@ def shrinking(
     *,
     on_progress: Callable[[Progress], object],
 ) -> Iterator[None]:
-    """Yield each time an archive must be made; videos shrink until it fits.
+    """Yield whenever an archive must be made, and shrink videos until it fits.
 
     Args:
         limit: maximum size of the archive in bytes.

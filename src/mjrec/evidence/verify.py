@@ -76,13 +76,13 @@ def verify(
 
     The archive may come from a stranger. Three processes read it, recreate the run and
     compare the two runs. Each has limits on memory and time, no network and no home
-    directory, and sees only what it needs: the second gets only the inputs
+    directory, and sees only the data it needs: the second gets only inputs
     (environment, seeds, actions, options). No code that the archive names is run,
     except environments in `trust`.
 
     Args:
         path: an archive from `mjrec pack`, an unpacked one, a monitor directory, or a
-            folder of several. In directories, missing files cannot be detected.
+            folder with several. In directories, missing files cannot be detected.
         level: where to stop: `"files"` (the bag contains what it lists), `"stats"`
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).
@@ -240,7 +240,7 @@ def _sample(sample: int | None) -> int | None:
     if isinstance(sample, bool) or operator.index(sample) < 1:
         raise InvalidArgument(
             "sample must be the number of frames to check in each video, 1 or more, "
-            f"got {sample!r}. Leave it out to check all of them."
+            f"got {sample!r}. Omit it to check all of them."
         )
     return operator.index(sample)
 

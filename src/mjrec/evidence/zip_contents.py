@@ -204,7 +204,7 @@ def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
     archive.fp.seek(info.header_offset)
     header = archive.fp.read(_LOCAL.size)
     if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
-        raise ValueError(f"{info.filename!r} is not at its stated place")
+        raise ValueError(f"{info.filename!r} is not at its stated position")
     fields = _LOCAL.unpack(header)
     name = archive.fp.read(fields[-2])
     encoding = "utf-8" if fields[2] & 0x0800 else "cp437"

@@ -49,7 +49,7 @@ class Probe:
     Attributes:
         backend: the backend's name.
         renders: whether a test frame with several colors was rendered correctly.
-        gl_renderer: the renderer's name in OpenGL; empty if unknown.
+        gl_renderer: the renderer's name as reported by OpenGL; empty if unknown.
         gl_vendor: the renderer's vendor.
         gl_version: the version of OpenGL, including the driver's.
         frames_per_second: rendering speed for a small scene at 480x480 pixels and
@@ -330,7 +330,7 @@ def _nothing_renders(
     asked: str | None, reason: str, rejected: list[tuple[str, Diagnosis]]
 ) -> str:
     if asked:
-        first = f"OpenGL backend {asked} ({reason}) cannot be used here."
+        first = f"The OpenGL backend {asked} ({reason}) cannot be used here."
         last = "Run `mjrec doctor` to see which backends work here."
     else:
         first = "No OpenGL backend can be used here."

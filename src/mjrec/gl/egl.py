@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EGL's devices, as listed by its library.
+"""The devices that the EGL library lists.
 
 This uses only ctypes, so it works even if mujoco and PyOpenGL cannot be imported.
 """

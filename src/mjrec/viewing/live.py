@@ -91,7 +91,7 @@ class LiveView:
             self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
         except OSError as error:
             raise InvalidArgument(
-                f"Port {port} cannot be used ({error.strerror}). Leave it out to use "
+                f"Port {port} cannot be used ({error.strerror}). Omit the port to use "
                 "any free port."
             ) from error
         self._server.daemon_threads = True

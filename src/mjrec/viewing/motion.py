@@ -144,7 +144,7 @@ class Stage:
 
     @property
     def camera_number(self) -> int | None:
-        """Index of the fixed camera of the recorded videos; None for other cameras."""
+        """Index of the fixed camera used in the videos; None for other cameras."""
         is_fixed = self._camera.type == int(mujoco.mjtCamera.mjCAMERA_FIXED)
         return int(self._camera.fixedcamid) if is_fixed else None
 
@@ -314,7 +314,7 @@ def _recorded_view(
         check_camera(model, view.camera)
     # NumPy and the bindings reject more invalid values than are checked explicitly.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise UnreadableFile(trajectory.path, f"its scene: {error}") from error
+        raise UnreadableFile(trajectory.path, f"in its scene: {error}") from error
     return view.camera, view.option
 
 
