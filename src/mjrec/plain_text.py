@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: counts, short lists, and escaped text from untrusted sources."""
+"""Human-readable text: counts, short lists, and escaped text from untrusted sources."""
 
 from __future__ import annotations
 

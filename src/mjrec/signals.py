@@ -21,7 +21,7 @@ _SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 class Terminated(SystemExit):
     """The exception for a signal that asks the process to end.
 
-    Like KeyboardInterrupt, it leaves `with` blocks, runs `finally` clauses, and is not
+    Like KeyboardInterrupt, it unwinds `with` blocks and `finally` clauses, and is not
     caught by `except Exception`. If it is not caught, the exit status is 128 plus the
     signal's number.
 

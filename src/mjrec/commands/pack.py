@@ -46,7 +46,7 @@ def pack(
         author: "Name", "Name <address>" or "Name <ORCID>". May be repeated.
         license: SPDX identifier of the license, such as CC-BY-4.0, or its URL.
         title: title of the run. Default: derived from the recordings.
-        anonymous: remove everything that names a user, a machine or an author.
+        anonymous: remove everything that identifies a user, a machine or an author.
         episodes: pack videos and states of these episodes only, such as 0,8,27. The
             archive records this choice.
         max_size: size limit, such as 50M. If needed, videos are rerendered at a

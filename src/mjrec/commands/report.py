@@ -45,7 +45,7 @@ def report(
         max_single_file_bytes: size limit of that page. Videos that do not fit are left
             out, with a note.
         replay: add a 3D page next to the videos of the best, median and worst episodes.
-            Creating it needs MuJoCo. It is loaded only when opened.
+            Creating that page requires MuJoCo. It is loaded only when opened.
         title: title of the page.
         verification: output of mjrec verify --json. May be repeated. A
             verification.json in a directory is found automatically.

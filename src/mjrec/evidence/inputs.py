@@ -69,7 +69,7 @@ Dtype: TypeAlias = Annotated[str, _dtype]
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInputs:
-    """The inputs of one episode: its reset, its actions, and what cut it off.
+    """The inputs of one episode: its reset, its actions, and any cut-off.
 
     Attributes:
         episode_id: the episode's number.
@@ -86,7 +86,7 @@ class EpisodeInputs:
             MuJoCo version or machine: each step then starts from the recorded state
             before it, so that differences in the last bits do not grow. `<name>.<part>`
             are the parts of `RecordedSteps` if the environment has wrappers.
-        has_actions: whether the actions were kept, in the array or as irregular ones.
+        has_actions: whether the actions were kept, in the array or as irregular actions.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of the arrays in a dictionary action; None if
             actions are plain arrays.
@@ -103,7 +103,7 @@ class EpisodeInputs:
         end_time: the stated end time.
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
             episode. They are used only if actions were not kept.
-        evaluation: `seed` and `episode` of the evaluation that it belongs to, or None.
+        evaluation: its `seed` and `episode` in an evaluation; None outside evaluations.
         selection: its video's facts about the choice among an evaluation's episodes.
     """
 

@@ -82,7 +82,7 @@ def pack(
             all, and must be used for a folder with several directories. The statistics,
             actions and seeds of all episodes are always packed, and the archive records
             the choice.
-        anonymous: remove everything that names a user, a machine or an author, for
+        anonymous: remove everything that identifies a user, a machine or an author, for
             blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
             million). If the archive is larger, its videos are rerendered from the
@@ -191,7 +191,7 @@ def _bag(
 def _make_bag(
     staged: Path, bag: Path, options: PackingOptions, identity: Identity | None
 ) -> PackedRun:
-    """Make a bag from the staged files; an earlier one is replaced."""
+    """Make a bag from the staged files, replacing any earlier bag."""
     shutil.rmtree(bag, ignore_errors=True)
     recordings = bag / PAYLOAD / RECORDINGS
     recordings.mkdir(parents=True)

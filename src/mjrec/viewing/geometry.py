@@ -296,7 +296,7 @@ def _repeated(
     """Return a mesh split for a repeated 2D texture, and its texture coordinates.
 
     Each side of a primitive shows the texture. On a height field, or a mesh without
-    texture coordinates, it is projected along z.
+    texture coordinates, the texture is projected along z.
     """
     material = int(model.geom_matid[shape.object_id])
     half = np.maximum(mesh.extents[:2] / 2, 1e-9)
