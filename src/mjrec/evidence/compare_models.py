@@ -50,7 +50,7 @@ def model_name(file: str) -> str:
 
 
 def renamed_models(given: Path, made: Path) -> dict[str, str]:
-    """Return the recreated names of models with the same sources but a new name."""
+    """Map models to their recreated names if only the names differ, not the sources."""
     sources: list[dict[str, str]] = []
     for folder in (given, made):
         names: dict[str, str] = {}

@@ -172,7 +172,7 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
 
 
 def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
-    """Add a directory's monitors, whose infixes must differ from all earlier ones."""
+    """Add a directory's monitors, whose infixes must differ from earlier infixes."""
     for monitor in monitors_of(place):
         if monitor.manifest is None:
             continue

@@ -86,7 +86,7 @@ class EpisodeInputs:
             MuJoCo version or machine: each step then starts from the recorded state
             before it, so that differences in the last bits do not grow. `<name>.<part>`
             are the parts of `RecordedSteps` if the environment has wrappers.
-        has_actions: whether the actions were kept, in the array or as irregular actions.
+        has_actions: whether the actions were kept, in the array or as irregular values.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of the arrays in a dictionary action; None if
             actions are plain arrays.

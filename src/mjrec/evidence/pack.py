@@ -82,8 +82,8 @@ def pack(
             all, and must be used for a folder with several directories. The statistics,
             actions and seeds of all episodes are always packed, and the archive records
             the choice.
-        anonymous: remove everything that identifies a user, a machine or an author, for
-            blind review.
+        anonymous: remove everything that identifies a user, a machine or an author,
+            for blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
             million). If the archive is larger, its videos are rerendered from the
             states at 3/4, 1/2, 3/8 or 1/4 of their width and height, and the archive

@@ -171,8 +171,8 @@ class Stage:
         Args:
             trajectory: the trajectory that contains these states; it may have grown
                 since the stage was created.
-            steps: `(N,)`, ascending indices of the states, none before a state that
-                was requested earlier.
+            steps: `(N,)`, ascending indices of the states. They must not precede
+                any state that was requested before.
 
         Raises:
             UnreadableFile: the file is missing or damaged.
