@@ -64,7 +64,7 @@ def test_help_shows_what_people_use_first(command, said):
     if command == "record":
         # Descriptions break only at the margin.
         words = " ".join(text.replace("│", " ").split())
-        assert "By default the environment's limit, or 1000" in words
+        assert "Default: the environment's limit, or 1000" in words
 
 
 @pytest.mark.parametrize("command", EXAMPLES)

@@ -193,6 +193,6 @@ def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, pai
     status, out, _ = mjrec(tmp_path, "--strict", *again_at)
     assert status == 1
     assert "1 video rendered, but blank:" in out
-    assert "all 5 frames are a single colour" in out
+    assert "all 5 frames are a single color" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == bool(again_at)

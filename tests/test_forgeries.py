@@ -774,7 +774,7 @@ EDITED = {
     **{
         what: (both(encoded_with(f"h264_metadata={said}"), claim_ffmpeg), line)
         for what, said, line in (
-            ("false colours", "matrix_coefficients=0", "colour tags"),
+            ("false colours", "matrix_coefficients=0", "color tags"),
             ("a message", f"sei_user_data={'ab' * 16}+Success", "frames and messages"),
             ("videos turned in the stream", TURNED, "frame"),
         )

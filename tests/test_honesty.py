@@ -95,7 +95,7 @@ HOPPER = {"id": "Hopper-v5"}
         (
             [recording(0, episode(0, type="t"), episode(1, type="e"))],
             NOTED,
-            "1 of 2 episodes are labelled training",
+            "1 of 2 episodes are labeled training",
         ),
         # The best of many would be a choice; chunks count together.
         (

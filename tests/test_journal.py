@@ -153,7 +153,7 @@ def test_a_line_that_does_not_fit_is_taken_back(path):
     assert read(path) == [ENTRY, NEXT, third]
     # One that is removed is noticed, and the entry after that begins another.
     path.unlink()
-    with pytest.raises(FileNotWritten, match="removed while it was written"):
+    with pytest.raises(FileNotWritten, match="removed while being written"):
         writer.append(ENTRY)
     assert not path.exists()
     writer.append(NEXT)

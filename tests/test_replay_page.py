@@ -392,7 +392,7 @@ def test_the_command_writes_an_episode_of_a_directory(cheetah, tmp_path, capsys)
     # Every fourth of 13 states, at twenty a second.
     assert capsys.readouterr().out.startswith(f"{page}: 4 states, ")
     assert main(["replay", str(cheetah.parent), "--episode", "3"]) == 1
-    assert "Recorded episodes: 0." in capsys.readouterr().err
+    assert "Available: 0." in capsys.readouterr().err
 
 
 def test_what_cannot_be_shown_is_left_out(cheetah, tmp_path):

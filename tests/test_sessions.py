@@ -93,7 +93,7 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, capl
     assert [each.video for each in record_session(asked)] == [None, None]
     assert mjrec.load_results(tmp_path)["episode_lengths"] == [2, 2]
     [line] = caplog.messages
-    assert "No videos, only statistics. Drawing CartPole-v1 needs pygame" in line
+    assert "only statistics, no videos. Drawing CartPole-v1 needs pygame" in line
     live = replace(asked, monitor=RecorderOptions(render="live", force=True))
     with pytest.raises(mjrec.MissingDependency, match="pygame"):
         list(record_session(live))

@@ -2,7 +2,7 @@
 """mjrec: a headless MuJoCo recorder.
 
 Importing this package does not load a simulator, OpenGL or ffmpeg, and does not change
-environment variables; each public name is loaded on first use.
+environment variables. Each public name is loaded on first use.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def __getattr__(name: str) -> Any:
             "dm_env", purpose=name, install='pip install "mjrec[dm-control]"'
         ) from error
     value = getattr(module, name)
-    # Cached, so that later uses cost nothing.
+    # Cached so that later uses cost nothing.
     globals()[name] = value
     return value
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entry point of `python -m mjrec`, which is the same as the command `mjrec`."""
+"""Entry point for `python -m mjrec`, which does the same as the command `mjrec`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captions drawn on frames: episode, step, time and return.
 
-Pillow draws the text in its built-in font, so it looks the same on every machine that
-has the same Pillow version: white letters over a dark band at the top of the frame.
+Pillow draws the text in its built-in font: white letters on a dark band at the top of
+the frame. The text looks the same on every machine with the same Pillow version.
 
 Pillow is an optional dependency and is imported when the first frame is annotated.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from .errors import MissingDependency
 from .frames import Frame
 
-# The default font size is the frame's height divided by this, within the limits below.
+# The default font size is the frame height divided by this, within the limits below.
 _LETTERS = 30
 _LARGEST_LETTERS = 64
 _USUAL_LETTERS = 11
@@ -56,10 +56,10 @@ class Caption:
 def annotated(frame: Frame, caption: Caption) -> Frame:
     """Return a copy of a frame with a caption at the top.
 
-    With the same Pillow version, the same frame and caption give the same bytes. The
-    font size grows with the frame. In a small frame, labels are abbreviated, items are
-    spread over several lines, or some items are left out. A frame of only a few pixels
-    gets no caption.
+    With the same Pillow version, the same frame and caption always give the same bytes.
+    The font size grows with the frame. In a small frame, labels are abbreviated, items
+    are spread over several lines, or some items are left out. A frame that is only a
+    few pixels in size gets no caption.
 
     Args:
         frame: `(height, width, 3) uint8`; not modified.
@@ -106,11 +106,11 @@ def check_annotation() -> str:
         MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
     try:
-        # Imported here because it is optional, and to keep mjrec quick to import.
+        # Imported late because Pillow is optional and would slow the import of mjrec.
         import PIL
         from PIL import ImageFont
 
-        # Before 10.1 the font had a fixed size; without FreeType it cannot be scaled.
+        # Before 10.1, the font had a fixed size. Without FreeType it cannot be scaled.
         ImageFont.load_default(size=_USUAL_LETTERS)
     except (ImportError, TypeError) as error:
         raise MissingDependency(
@@ -122,7 +122,7 @@ def check_annotation() -> str:
 
 
 class _Layout(NamedTuple):
-    """The positions of a caption's items in frames of one size.
+    """The layout of a caption for frames of one size.
 
     Attributes:
         height: the band's height.
@@ -139,8 +139,8 @@ class _Layout(NamedTuple):
     places: tuple[tuple[int, int, int], ...]
 
 
-# Arrangements in order of preference: all items in as few lines as fit, then fewer
-# and fewer items.
+# Arrangements in order of preference: first all items on as few lines as possible,
+# then fewer items.
 _ARRANGEMENTS = (
     (((0, 1, 2, 3),), ((0, 1), (2, 3)), ((0,), (1,), (2,), (3,))),
     (((0, 1), (3,)), ((0,), (1,), (3,))),
@@ -156,7 +156,7 @@ def _layout(height: int, width: int, lengths: tuple[int, ...]) -> _Layout | None
     Args:
         height: the frame's height.
         width: the frame's width.
-        lengths: the lengths of the items' numbers; -1 for an item that is left out.
+        lengths: the length of each item's number; -1 for an item that is left out.
     """
     usual = max(_USUAL_LETTERS, min(_LARGEST_LETTERS, round(height / _LETTERS)))
     for arrangements in _ARRANGEMENTS:

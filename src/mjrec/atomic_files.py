@@ -5,9 +5,9 @@ A file is written under a temporary name in its own directory and then renamed, 
 incomplete file never has the final name. The temporary name starts with a dot and ends
 in `.part`: `.<name>.<8 hex digits>.part`.
 
-A piece that is appended is a line of a journal, a row of a table or a TensorBoard
-record. An incomplete piece would corrupt the next one. Appended data survives the death
-of the process that wrote it.
+An appended piece is a line of a journal, a row of a table or a TensorBoard record. An
+incomplete piece would corrupt the next one. Appended data survives the death of the
+process that wrote it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from .errors import DirectoryNotWritable, FileNotWritten
 def temporary_path(path: Path) -> Path:
     """Return a new temporary name for `path`, in the same directory.
 
-    The name starts with exactly one dot, even if `path` itself is hidden: programs that
-    clean up a directory recognize the file by that dot.
+    The name starts with exactly one dot, even if `path` itself is hidden. Programs that
+    clean up a directory recognize temporary files by that dot.
     """
     name = path.name.removeprefix(".")
     return path.with_name(f".{name}.{secrets.token_hex(4)}.part")
@@ -35,11 +35,11 @@ def temporary_path(path: Path) -> Path:
 
 @contextlib.contextmanager
 def writing(path: Path, **advice: str) -> Iterator[None]:
-    """Turn any other `OSError` raised in the block into `FileNotWritten`.
+    """Convert any `OSError` raised in the block to `FileNotWritten`.
 
     Args:
         path: the file that the block writes.
-        **advice: `then`, if `FileNotWritten` should give other advice.
+        **advice: `then`, if `FileNotWritten` should give different advice.
     """
     try:
         yield
@@ -110,22 +110,22 @@ def append_whole(descriptor: int, piece: bytes, *, torn: bytes = b"") -> None:
         descriptor: a descriptor from `open_for_appending`.
         piece: the bytes to append.
         torn: bytes to write before the piece if the file does not end with a line feed
-            (its last writer was killed in the middle of a line).
+            (because its last writer was killed in the middle of a line).
 
     Raises:
-        OSError: the disk is full (then the file is unchanged), or the file was removed.
+        OSError: the disk is full (the file is then unchanged), or the file was removed.
     """
     status = os.fstat(descriptor)
     if status.st_nlink == 0:
-        # The file has no name any more: anything written to it would be lost.
-        raise FileNotFoundError(errno.ENOENT, "it was removed while it was written")
+        # The file has been deleted: anything written to it would be lost.
+        raise FileNotFoundError(errno.ENOENT, "it was removed while being written")
     if torn and status.st_size:
         is_torn = os.pread(descriptor, 1, status.st_size - 1) != b"\n"
         piece = torn * is_torn + piece
     written = os.write(descriptor, piece)
     if written != len(piece):
-        # Only part of the piece was written. If another piece already follows it, the
-        # part stays, and readers skip it.
+        # The piece was written only in part. Remove that part, unless another piece
+        # already follows it; readers will then skip it.
         end = os.lseek(descriptor, 0, os.SEEK_CUR)
         if os.fstat(descriptor).st_size == end:
             os.ftruncate(descriptor, end - written)
@@ -141,9 +141,9 @@ def file_sha256(path: Path) -> str:
 class AppendOnlyFile:
     """A new file to which whole pieces are appended immediately.
 
-    A piece is appended completely or not at all, because half a row would be read as a
-    different row, and nothing after half a record would be read. Appended pieces
-    survive the end of this process.
+    A piece is appended completely or not at all: a partial row would be read as a
+    different row, and a partial record would make all later records unreadable.
+    Appended pieces survive the end of this process.
 
     Args:
         names: candidate paths, which may come from an iterator. The first path that
@@ -167,13 +167,13 @@ class AppendOnlyFile:
                 raise DirectoryNotWritable(path.parent, error.strerror) from error
             self.path = path
             return
-        raise ValueError("names must contain a name that is not in use")
+        raise ValueError("names must contain a path that does not exist yet")
 
     def append(self, piece: bytes) -> None:
         """Append `piece`.
 
         Raises:
-            FileNotWritten: the disk has no room for the piece. The file is unchanged.
+            FileNotWritten: the disk is full. The file is unchanged.
         """
         with writing(self.path):
             append_whole(self._file.fileno(), piece)

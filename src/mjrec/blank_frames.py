@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of videos that show nothing: all black, a single colour, or no movement.
+"""Detection of videos that show nothing: all black, a single color, or no movement.
 
 If a light is missing, the camera is inside a wall, or the OpenGL context belongs to
 another thread, a video can have all of its frames and still be useless.
@@ -25,16 +25,16 @@ _STEP = 16
 
 
 class BlankFrames:
-    """A check whether the frames of a video show anything.
+    """A check of whether a video's frames show anything.
 
-    Checking stops once there has been a frame that is not black, a frame with two
-    colours, and a frame that differs from the first. Only frames that could be blank
-    are checked completely.
+    Checking stops as soon as the video is known to have a frame that is not black, a
+    frame with two colors, and a frame that differs from the first. Only frames that
+    could be blank are checked completely.
     """
 
     def __init__(self) -> None:
         self._count = 0
-        # The kinds of blankness that all frames so far have in common.
+        # The kinds of blankness that all frames so far share.
         self._suspects = set(_LOOKS)
         self._first: Frame | None = None
 
@@ -55,8 +55,8 @@ class BlankFrames:
         """Return facts for the video's metadata, or an empty dict if nothing is wrong.
 
         `suspect_black`: all frames are black. `suspect_constant`: each frame has a
-        single colour, or there are several frames and all are equal. Black frames of a
-        single colour have both.
+        single color, or there are several frames and all are equal. Uniformly black
+        frames set both.
         """
         if not self._count:
             return {}
@@ -73,7 +73,7 @@ class BlankFrames:
         if "black" in self._suspects:
             return f"{frames} black"
         if "plain" in self._suspects:
-            return f"{frames} a single colour"
+            return f"{frames} a single color"
         return f"{frames} identical"
 
     def judge(self, video: Path, *, strict: bool) -> None:
@@ -97,8 +97,8 @@ def _is_plain(frame: Frame, first: Frame) -> bool:
     return bool((row == row[:, :1]).all()) and bool((frame == row).all())
 
 
-# Tests for the ways a frame (or a sample of it) may look blank; the second argument is
-# the video's first frame.
+# Tests for the ways in which a frame (or a sample of it) may look blank. The second
+# argument is the video's first frame.
 _LOOKS: dict[str, Callable[[Frame, Frame], bool]] = {
     "black": lambda frame, first: int(frame.max()) <= _BLACK,
     "plain": _is_plain,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that run one of mjrec's modules, which creates a `Parent`.
+"""Child processes, each of which runs an mjrec module that creates a `Parent`.
 
 multiprocessing is not used. Its children import the caller's main module (so a script
 without a `__main__` guard runs twice) and cannot be started from daemonic processes.
-Children that it forks inherit OpenGL's locks without its threads.
+Its forked children inherit OpenGL's locks but not OpenGL's threads.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ _LONGEST_PAUSE = 0.02
 
 
 class Child:
-    """A Python process that runs one of mjrec's modules, which creates a `Parent`.
+    """A Python process that runs an mjrec module, which creates a `Parent`.
 
     The process has its own session, so Ctrl-C in the terminal reaches only the parent.
-    It ends on `end`, when the `with` block is left, on garbage collection, and at
-    interpreter exit. It also notices when the parent dies, for whatever reason.
+    `end`, leaving the `with` block, garbage collection and interpreter exit end the
+    process. It also notices when the parent dies, whatever the cause.
 
     Args:
         module: the module to run.
         arguments: its command-line arguments.
         environ: its environment variables, except the module search path.
-        cwd: its working directory, if it is not forked; if None, the parent's.
+        cwd: its working directory, unless it is forked; None for the parent's.
         is_heard: whether the caller reads the output from the pipe `words`. If False,
             the output is kept in memory, and `last_words` includes its end.
         fork: a function to call in a fork of this process, instead of running the
@@ -67,8 +67,8 @@ class Child:
 
     Attributes:
         pid: the process id.
-        most_bytes: maximum size of a message, which no frame reaches. After a longer
-            message, no more messages are received.
+        most_bytes: maximum size of a message, larger than any frame. After a message
+            that exceeds it, no more messages are received.
     """
 
     most_bytes = MOST_BYTES
@@ -101,7 +101,7 @@ class Child:
                     pass_fds=pipes,
                     start_new_session=True,
                 )
-                # `_Process` waits for it, so `subprocess` must not.
+                # `_Process` waits for the child, so `subprocess` must not.
                 process.returncode = 0
                 self.pid = process.pid
         except BaseException:
@@ -172,7 +172,7 @@ class Child:
     def stacks(self) -> str:
         """Return the stacks of a hanging child's threads, for the log."""
         before = after = self._size_of_words()
-        # The signal kills a child that has not set its handler yet. SIGCONT is for a
+        # The signal kills a child that has not set its handler yet. SIGCONT resumes a
         # child that was only stopped.
         self._process.send_signal(STACKS_SIGNAL)
         self._process.send_signal(signal.SIGCONT)
@@ -209,7 +209,7 @@ class Child:
             return f"was killed by signal {-status}"
 
     def forget_words(self) -> None:
-        """Drop the output so far if it is large."""
+        """Discard the output so far if it is large."""
         if self._size_of_words() > _MOST_WORDS:
             os.ftruncate(self.words.fileno(), 0)
 
@@ -221,7 +221,7 @@ class Child:
         return 0.0
 
     def kill(self) -> None:
-        """Kill the child and its children, which may hang too; `end` cleans up."""
+        """Kill the child and its own children, which may hang too; `end` cleans up."""
         children = _pids_of_children(self.pid)
         self._process.send_signal(signal.SIGKILL)
         for pid in children:
@@ -253,13 +253,13 @@ class Child:
         return os.fstat(self.words.fileno()).st_size
 
     def _words_from(self, begin: int) -> str:
-        # Without seeking, because the file position is shared with the child.
+        # Read without seeking, because the file position is shared with the child.
         output = os.pread(self.words.fileno(), _MOST_WORDS_READ, begin)
         return output.decode(errors="replace").strip()
 
 
 def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
-    """Wait until a child sends something or ends, and return the children that did.
+    """Wait until at least one child sends something or ends, and return such children.
 
     Args:
         children: the children to wait for.
@@ -283,7 +283,7 @@ def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
 
 
 class _Process:
-    """A process that this one has started: its exit status, and signals to it."""
+    """A child process, with its exit status and a way to send it signals."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -295,7 +295,7 @@ class _Process:
             os.kill(self._pid, signum)
 
     def wait(self, seconds: float) -> int | None:
-        """Return the exit status in `subprocess`'s form, or None if it still runs."""
+        """Return the exit status in `subprocess`'s form, or None if still running."""
         deadline, pause = time.monotonic() + seconds, 0.0005
         while (status := self._poll()) is None:
             rest = deadline - time.monotonic()
@@ -320,8 +320,8 @@ class _Process:
 def _pipe() -> tuple[int, int]:
     """Return both ends of a pipe, as descriptors above those of the standard streams.
 
-    If a standard stream is closed, a new pipe may get its number, and the child's own
-    standard stream would then replace it.
+    If a standard stream is closed, a new pipe may get its number. The child's own
+    standard stream would then replace the pipe.
     """
     ends = os.pipe()
     reading, writing = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)
@@ -331,9 +331,9 @@ def _pipe() -> tuple[int, int]:
 
 
 def _memory() -> tuple[int, int]:
-    """Return two descriptors of a file in memory."""
+    """Return two descriptors of an in-memory file."""
     words = os.memfd_create("mjrec-words")
-    # Appending lets the file be emptied while the child writes to it.
+    # In append mode, the file can be emptied while the child writes to it.
     fcntl.fcntl(words, fcntl.F_SETFL, os.O_APPEND)
     return words, os.dup(words)
 
@@ -350,7 +350,7 @@ def _forked(
     try:
         os.setsid()
         os.environ.update(environ)
-        # Undo what was set in the process that this one is a copy of.
+        # Undo the settings that were copied from the parent.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         logging.getLogger().handlers.clear()
         for descriptor in (1, 2):
@@ -376,7 +376,7 @@ def _end_child(process: _Process, files: tuple[IO[bytes], ...], owner: int) -> N
         process.send_signal(signal.SIGTERM)
         if process.wait(_SECONDS_TO_END) is None:
             process.send_signal(signal.SIGKILL)
-            # A process that is blocked in a disk or a driver does not die.
+            # A process that is blocked by a disk or a driver does not die.
             process.wait(_SECONDS_TO_END)
 
 
@@ -392,7 +392,7 @@ _children: weakref.WeakSet[Child] = weakref.WeakSet()
 
 
 def _leave_all_to_parent() -> None:
-    """Close a forked child's copies of the pipes, which would stay open otherwise."""
+    """Close a forked child's copies of the pipes, which would otherwise stay open."""
     for child in list(_children):
         child.end()
 
@@ -441,9 +441,9 @@ def _is_of_main(entry: str) -> bool:
 
 @contextlib.contextmanager
 def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """Set or, for None, remove environment variables inside the block.
+    """Set environment variables inside the block, or remove those that are None.
 
-    Afterwards all variables are restored, including those that the block itself set.
+    After the block, all variables are restored, including those that the block set.
     """
     before = dict(os.environ)
     for name in changes:

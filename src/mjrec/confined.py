@@ -5,8 +5,8 @@
 itself before it imports the module, because confining a thread does not confine threads
 that already exist. An unprivileged Linux process can use:
 
-- Landlock (Linux 5.13): only Python, the system and the named paths can be read, and
-  only named paths can be written; since Linux 6.7, TCP connections are blocked too.
+- Landlock (Linux 5.13): only Python, the system and the given paths can be read, and
+  only given paths can be written to. Since Linux 6.7, TCP is blocked too.
 - An empty network namespace, if the system lets users create one.
 
 If the kernel supports neither, the only protection is the sandbox's limits, an empty
@@ -43,7 +43,7 @@ _READ = 0b1101  # execute, read a file, read a folder
 _RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 _NO_TCP = 0b11
 _SCOPES = 0b11  # abstract sockets and signals
-# Version 4 added TCP, version 6 the scopes.
+# Landlock version 4 added TCP, and version 6 added the scopes.
 _WITH_TCP, _WITH_SCOPES = 4, 6
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -88,7 +88,7 @@ def confine(
 
 def _leave_network() -> None:
     user, group = os.getuid(), os.getgid()
-    # A process without the privilege may have it inside its own user namespace.
+    # An unprivileged process may have this right inside its own user namespace.
     if _libc.unshare(_CLONE_NEWNET) == 0:
         return
     if _libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET) != 0:

@@ -54,8 +54,8 @@ class Error(Exception):
     """Base class of all errors that mjrec raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Subclasses take facts and build the message from them, but pickle (for an
-        # error from a worker process) would call them with the message.
+        # Subclasses build the message from their arguments, but pickle (used for errors
+        # from worker processes) would call them with the finished message.
         return rebuilt, (type(self), str(self), vars(self))
 
 
@@ -78,7 +78,7 @@ class UnknownName(InvalidArgument):
     """A name that does not exist.
 
     Attributes:
-        kind: the kind of thing that was looked up, for example `"camera"`.
+        kind: what was looked up, for example `"camera"`.
         name: the requested name.
         available: the names that exist.
     """
@@ -110,7 +110,7 @@ class ExistingRecordings(Error):
 
     Attributes:
         directory: the requested directory.
-        names: the base names of the monitor files in it.
+        names: the base names of the monitor files in the directory.
     """
 
     def __init__(self, directory: Path, names: Sequence[str]) -> None:
@@ -160,7 +160,7 @@ class FileNotWritten(Error, OSError):
 
 
 class DifferentEnvironment(Error):
-    """`resume=True` with recordings of a different environment."""
+    """`resume=True` was given for recordings of a different environment."""
 
     def __init__(self, directory: Path, recorded: str, asked: str) -> None:
         self.recorded = recorded
@@ -173,11 +173,11 @@ class DifferentEnvironment(Error):
 
 
 class DifferentEvaluation(Error):
-    """`resume=True` for an evaluation that was started with different options.
+    """`resume=True` was given for an evaluation started with different options.
 
     Attributes:
         directory: the evaluation's directory.
-        differences: pairs of old and new values, by option.
+        differences: pairs of old and new values, keyed by option.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class RenderError(Error):
 
     Attributes:
         directory: the directory of the recordings.
-        failures: the reasons, by video name.
+        failures: the reasons, keyed by video name.
     """
 
     def __init__(self, directory: Path, failures: Mapping[str, str]) -> None:
@@ -247,7 +247,7 @@ class BlankVideo(Error):
     Attributes:
         path: the video, which is kept together with its metadata.
         frame_count: number of frames.
-        suspicion: what is wrong.
+        suspicion: a description of the problem.
     """
 
     def __init__(self, path: Path, *, frame_count: int, suspicion: str) -> None:
@@ -360,7 +360,7 @@ class IdentityLeft(PackError):
     """The archive would still name a person or machine despite `anonymous=True`.
 
     Attributes:
-        found: pairs of a file and what was found in it.
+        found: pairs of a file and the name found in it.
     """
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
@@ -378,7 +378,7 @@ class UnreadableFile(Error):
 
     Attributes:
         path: the file.
-        reason: what is wrong with it.
+        reason: what is wrong with the file.
     """
 
     _message = "Cannot read {path}: {reason}."
@@ -418,10 +418,10 @@ class MissingDependency(Error, ImportError):
     """An optional package or program is needed, but missing or unusable.
 
     Args:
-        package: its name.
-        purpose: what needs it.
+        package: the dependency's name.
+        purpose: the feature that needs it.
         install: the command that installs it.
-        reason: what is wrong with it; None if it is not installed.
+        reason: why it is unusable; None if it is not installed.
     """
 
     def __init__(

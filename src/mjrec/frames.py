@@ -82,10 +82,10 @@ def check_size(height: int, width: int) -> tuple[int, int]:
 
 
 def pad_to_even(frame: Frame) -> Frame:
-    """Return `frame` with an odd side extended by repeating its last row or column.
+    """Return `frame` with each odd side extended by repeating its last row or column.
 
-    yuv420p stores one colour sample for each block of two by two pixels, so a video's
-    sides must be even. Repeating an edge leaves all other pixels unchanged and in
+    yuv420p stores one color sample for each block of two by two pixels, so a video's
+    sides must be even. Repeating an edge leaves all original pixels unchanged and in
     place.
     """
     height, width = frame.shape[:2]
@@ -95,7 +95,7 @@ def pad_to_even(frame: Frame) -> Frame:
 
 
 def grid_shape(count: int) -> tuple[int, int]:
-    """Return the numbers of rows and columns of a grid for `count` frames.
+    """Return the number of rows and columns in a grid for `count` frames.
 
     The grid is as square as possible, and never has more rows than columns.
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """JSON that every reader accepts and that can be read back without loss.
 
-JSON (RFC 8259) has no NaN or infinity. Infinity is written as the number `1e999`, which
-is valid JSON and which every IEEE-754 reader, including Python's, reads as infinity.
+JSON (RFC 8259) has no NaN or infinity. Infinity is written as the number `1e999`: this
+is valid JSON, and every IEEE 754 reader, including Python's, reads it as infinity.
 NaN is written as `null`. NumPy scalars and arrays are written as numbers and lists.
 
 Input may be untrusted. It is rejected if two readers could interpret it differently
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 # The maximum nesting depth. Python writes, compares and prints values recursively, and
-# everything that can be read must survive that.
+# all of this must work for any value that can be read.
 _DEEPEST = 100
 
 # The maximum number of lists, objects and their items; each takes about 80 bytes at
@@ -30,7 +30,7 @@ _MOST_VALUES = 1 << 24
 
 _FLAT = {str, int, float, bool, type(None)}
 
-# Strings, and Python's tokens for numbers that JSON does not have.
+# Strings, and Python's tokens for the numbers that JSON lacks.
 _TOKENS = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 _NUMBERS = {"NaN": "null", "Infinity": "1e999", "-Infinity": "-1e999"}
 
@@ -39,10 +39,10 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     """Return `value` as JSON text.
 
     Objects that JSON cannot represent (a path, an environment's own option type, a dict
-    with the keys 1 and "1") are written as `{"repr": ...}`, because information for
-    people must never stop a run.
+    with the keys 1 and "1") are written as `{"repr": ...}`, because purely informative
+    values must never stop a run.
     """
-    # Nearly all values are plain, and plain values are many times faster to write.
+    # Nearly all values are plain, and those can be written many times faster.
     try:
         text = json.dumps(
             value if _is_plain(value) else _made_plain(value), indent=indent

@@ -3,7 +3,7 @@
 
 The last bits of a simulation depend on these facts and on MuJoCo's version. MuJoCo
 calls the C library's sine and exponential functions, which choose their code by CPU
-features: without FMA, the same wheel on the same machine gives different trajectories.
+feature. Without FMA, the same wheel gives different trajectories on the same machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MODELS = ("model name", "CPU part")
 
 
 def usable_cpus() -> int:
-    """Return the number of CPUs that this process can keep busy, which is at least 1.
+    """Return the number of CPUs that this process can keep busy, at least 1.
 
     This is the number of CPUs that the process may run on (its affinity), or its
     cgroup's quota if that is less: a container with 2.5 of 64 CPUs can use 2.
@@ -73,7 +73,7 @@ def gpu_device_files(*, root: Path = Path("/dev")) -> list[str]:
 
 @functools.cache
 def machine_fingerprint() -> Mapping[str, str]:
-    """Return the facts that must be equal on two machines for bit-identical results.
+    """Return the facts in which two machines must agree for bit-identical results.
 
     Returns:
         `architecture`, `libc` (name and version), `cpu_flags` (the SHA-256 of the

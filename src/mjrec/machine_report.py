@@ -20,8 +20,8 @@ from .gl.backends import BACKENDS, Diagnosis, diagnose, platforms_contradict
 from .gl.choice import Probe, choose, probe
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-# Each entry: a distribution, a program that uses it as a recording does but does not
-# render, and the command that installs it.
+# Each entry: a distribution, a program that uses it as a recording does but without
+# rendering, and the command that installs it.
 _PACKAGES = (
     ("mjrec", "", ""),
     ("mujoco", "import mujoco", "python -m pip install mujoco"),
@@ -66,7 +66,7 @@ class Package:
         name: the package's name.
         version: its version; None if it is not installed.
         works: whether a minimal program that uses it succeeds; None if not tried.
-        cause: the reason why it does not work.
+        cause: why it does not work.
         fix: instructions for fixing or installing it.
     """
 
@@ -85,7 +85,7 @@ class Ffmpeg:
         path: path of the executable; None if it was not found.
         version: the first line of its version output.
         encodes: whether it encoded a test frame as H.264.
-        cause: the reason why it failed.
+        cause: why it failed.
         fix: instructions for fixing it.
     """
 
@@ -188,7 +188,7 @@ def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosi
                 f"Use {other}:\n  export MUJOCO_GL={other}",
             )
         return
-    # Settings that mjrec corrects for itself, but other programs do not.
+    # Settings that mjrec corrects for itself, but that other programs do not correct.
     if platforms_contradict(os.environ, chosen):
         yield Diagnosis(
             f"PYOPENGL_PLATFORM={os.environ['PYOPENGL_PLATFORM']} contradicts "
@@ -233,7 +233,7 @@ def examine_ffmpeg() -> Ffmpeg:
 
 
 def examine_package(name: str, program: str, install: str) -> Package:
-    """Look for a package and try it.
+    """Look up a package and test it.
 
     Args:
         name: the distribution's name.
@@ -287,7 +287,7 @@ def _gpu() -> Package:
     except OSError:
         if gpu_device_files():
             return Package("GPU", "found, but without NVIDIA's driver")
-        fix = "There is no GPU device file in /dev: videos are rendered on the CPU."
+        fix = "There is no GPU device file in /dev, so videos are rendered on the CPU."
         return Package("GPU", None, fix=fix)
     return Package("GPU", output.partition("\n")[0].strip())
 

@@ -33,7 +33,7 @@ Message: TypeAlias = "dict[str, Any] | bytearray"
 PIPES_VARIABLE = "MJREC_PARENT"
 # The signal that makes a child write the stacks of its threads to standard error.
 STACKS_SIGNAL = signal.SIGUSR1
-# The maximum size of a message. No frame is as large; a longer message ends the stream.
+# The maximum size of a message, larger than any frame. A larger one ends the stream.
 MOST_BYTES = 1 << 32
 
 # Each message starts with a flag (whether its content is a frame) and its length.
@@ -146,8 +146,8 @@ def _plain(value: Any) -> Any:
 class Parent:
     """The connection to the process that started this one as a `Child`.
 
-    Messages do not use standard input or output, because libraries and drivers print
-    whenever they like. Standard input is empty, and standard output goes to standard
+    Messages do not use standard input or output, because libraries and drivers may
+    print at any time. Standard input is empty, and standard output goes to standard
     error. Processes that this one starts or forks cannot use the connection.
 
     This process writes the stacks of its threads to standard error when `Child.stacks`
@@ -190,11 +190,11 @@ class Parent:
         return not self._said.empty()
 
     def listen(self, at_end: Callable[[], object] | None = None) -> None:
-        """Receive on a thread from now on, to notice at once when the parent ends.
+        """From now on, receive on a thread that notices at once when the parent ends.
 
         Args:
             at_end: a function to call on that thread when the parent has ended. After
-                that (or at once if None), this process exits, because nothing else
+                that (or immediately, if None), this process exits, because nothing else
                 needs its work.
         """
         self._listens = True
@@ -217,7 +217,7 @@ class Parent:
         logging.getLogger().addHandler(_ToParent(self))
 
     def _listen(self, at_end: Callable[[], object] | None) -> None:
-        # The connection is reset if the parent died before it had read everything.
+        # The connection is reset if the parent died before reading everything.
         with contextlib.suppress(OSError):
             for message in self._messages:
                 assert isinstance(message, dict)
@@ -241,5 +241,5 @@ class _ToParent(logging.Handler):
         try:
             self._parent.send(log=[record.name, record.levelno, self.format(record)])
         except Exception:
-            # No handler may let an error reach the code that logs.
+            # A handler must not raise errors in the code that logs.
             self.handleError(record)

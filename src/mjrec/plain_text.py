@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: counts, short lists, and escaped text from untrusted sources."""
+"""Human-readable text: counts, short lists, and escaped text from untrusted sources."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
-# Newlines and the spaces between digits are harmless, although they are not printable.
+# Newlines and the spaces between digits are harmless, although unprintable.
 _SEEN: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 
 
@@ -48,9 +48,9 @@ def listed(
     """Return the first few items: "a, b and 2 more".
 
     Args:
-        items: the items, or only the first of them.
+        items: the items, or just the first ones.
         most: maximum number of items to list.
-        count: the number of items, if not all are given.
+        count: the total number of items, if not all are given.
         between: the text between two items.
     """
     shown = between.join(map(str, items[:most]))

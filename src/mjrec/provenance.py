@@ -2,13 +2,13 @@
 """Provenance of a recording: packages, machine, variables, command line and code.
 
 Collecting it takes a third of a second or more, mostly in other processes. A thread
-collects it once, and it is read when a manifest is written.
+collects it once, and it is used whenever a manifest is written.
 
 Reading the files of a hundred packages keeps Python busy for a fifth of a second. On a
 thread of the simulating process, this would cost even more: whenever a step releases
 the interpreter lock, the thread holds it for five milliseconds. That nearly stops the
-simulation until everything is read (200 steps of HalfCheetah in a tenth of a second
-instead of 1600). So a separate process reads the files, by running this module.
+simulation until all files are read (200 steps of HalfCheetah in a tenth of a second
+instead of 1600). So a separate process, which runs this module, reads the files.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ _PREFIXES = (
     *("EGL_", "GALLIUM_", "GALLIVM_", "LIBGL_", "LP_", "MESA_", "MJREC_", "MKL_"),
     *("MUJOCO_", "NVIDIA_", "OMP_", "OPENBLAS_", "__EGL_"),
 )
-# Files that an installer changes, or adds to the files of a wheel.
+# Files that an installer changes or adds when it installs a wheel.
 _OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
 _NAME_OR_VERSION = re.compile(r"^(Name|Version): *(.*?) *$", re.MULTILINE)
 _SECONDS_FOR_PACKAGES = 60.0
 _SECONDS_FOR_GIT = 5.0
-# Short, so that a program ends quickly.
+# Short, so that programs exit quickly.
 _SECONDS_AT_THE_END = 2.0
 
-# The command line that recordings name. A worker sets that of the evaluation.
+# The command line stored in recordings. A worker sets it to that of the evaluation.
 command = sys.orig_argv
 
 
@@ -73,7 +73,7 @@ class Provenance:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._found: dict[str, Any] | None = None
-        # These can change later, so they are read at once.
+        # These can change later, so they are read immediately.
         self._command = list(command)
         self._directory = str(Path.cwd())
         self._variables = {
@@ -90,7 +90,7 @@ class Provenance:
         """Return the provenance, or None if it has not been collected.
 
         Args:
-            wait: whether to wait for it, for at most two seconds.
+            wait: whether to wait up to two seconds for it to be collected.
 
         Returns:
             None if it is not ready or could not be collected. Otherwise `command`,
@@ -125,8 +125,8 @@ class Provenance:
             self._found = {**found, "code": None}
             self._found = {**found, "code": _code(self._root)}
         except Exception:
-            # A recording must not fail because of this. A process that is exiting has
-            # ended the child that lists its packages, and no longer needs the list.
+            # This must not make a recording fail. An exiting process has ended the
+            # child that lists its packages, and no longer needs the list.
             if threading.main_thread().is_alive():
                 logger.warning("The provenance could not be collected.", exc_info=True)
 
@@ -137,7 +137,7 @@ def look_around() -> Provenance:
     return Provenance(_code_root())
 
 
-# A child that is forked while the thread is running does not have that thread.
+# A child forked while the thread is running does not have that thread.
 os.register_at_fork(after_in_child=look_around.cache_clear)
 
 
@@ -174,7 +174,7 @@ def _git(root: Path, *arguments: str) -> str | None:
     """Return git's output, or None if git is missing, fails or takes too long."""
     try:
         done = subprocess.run(
-            # A repository's own configuration could name a program to run.
+            # A repository's own configuration could make git run a program.
             ["git", "-c", "core.fsmonitor=false", *arguments],
             cwd=root,
             env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
@@ -198,7 +198,7 @@ def installed_packages() -> dict[str, Any]:
         is the SHA-256 of the wheel's own list of its files, or None if it has no list.
     """
     places = [entry for entry in sys.path if isinstance(entry, str)]
-    # A Python that is embedded in another program has no executable to start.
+    # A Python embedded in another program has no executable to start.
     if sys.executable and not getattr(sys, "frozen", False):
         with (
             contextlib.suppress(OSError),
@@ -218,7 +218,7 @@ def _packages_in(places: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for distribution in importlib.metadata.distributions(path=list(places)):
         name, version = _name_and_version(distribution)
-        # The first one on the path is the one that is imported.
+        # Python imports the first installation on the path.
         if name and name not in found:
             found[name] = {
                 "version": version,
@@ -230,7 +230,7 @@ def _packages_in(places: Sequence[str]) -> dict[str, Any]:
 def _name_and_version(
     distribution: importlib.metadata.Distribution,
 ) -> tuple[str | None, str | None]:
-    """Return a package's name and version, without slowly parsing all metadata."""
+    """Return a package's name and version quickly, without parsing all metadata."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
     answer = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
     return answer.get("Name"), answer.get("Version")
@@ -276,7 +276,7 @@ PACKAGES = (
 
 @functools.cache
 def versions(*more: str) -> Mapping[str, str]:
-    """Return the versions of Python and of mjrec's main packages that are installed.
+    """Return the versions of Python and of mjrec's main packages, if installed.
 
     Args:
         *more: names of additional packages.

@@ -10,8 +10,8 @@ from fractions import Fraction
 
 from .errors import InvalidArgument
 
-# Floats are binary. This limit recovers the intended fraction (0.05 becomes 1/20) with
-# an error of less than a millionth of a millionth of a second.
+# The largest denominator in the conversion of a float to the intended fraction (0.05 to
+# 1/20). The error is less than 1e-12 seconds.
 MAX_DENOMINATOR = 10**6
 
 
@@ -41,7 +41,7 @@ def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     rate = (
         Fraction(fps)
         if isinstance(fps, numbers.Rational)
-        # Via the shortest decimal string, so that 29.97 in float32 is 2997/100 too.
+        # Via the shortest decimal string, so that 29.97 in float32 is also 2997/100.
         else Fraction(str(fps)).limit_denominator(MAX_DENOMINATOR)
     )
     if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process with resource limits, in which an mjrec module reads untrusted files.
 
-Whatever a hostile file does to HDF5, MuJoCo, OpenGL or ffmpeg happens in that process.
-The parent sends one request; the child first calls `enter` and then sends its answers.
+If a hostile file attacks HDF5, MuJoCo, OpenGL or ffmpeg, only that process is affected.
+The parent sends one request. The child first calls `enter` and then sends its answers.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NOTHING: Mapping[str, str] = {}
 
 
 class Sandbox(Child):
-    """The sandboxed process, seen from its parent.
+    """A sandboxed process, as seen from its parent.
 
     Leaving the `with` block ends the process and its process group.
 
@@ -67,8 +67,8 @@ class Sandbox(Child):
         limits: resource limits, keyed by their names in `resource`.
         more_environ: environment variables in addition to this process's.
         readable: if given, the process can read only Python, the system and these
-            paths, can write only to `place`, and has no network or home folder, if
-            `confined` can enforce this here.
+            paths, can write only to `place`, and has no network or home folder, as far
+            as `confined` can enforce this here.
 
     Raises:
         Error: the process cannot be started.
@@ -116,7 +116,7 @@ class Sandbox(Child):
         """
         for message in self.messages(timeout_s):
             if message is None:
-                logger.warning("A sandboxed process hangs: %s", self.stacks())
+                logger.warning("A sandboxed process is hanging: %s", self.stacks())
             yield message
 
     def __exit__(self, *error: object) -> None:

@@ -69,7 +69,7 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
 
     Args:
         function: the user's function.
-        name: the option through which the function was given.
+        name: the option that the function was given for.
         what: a description of the argument that the function will receive.
 
     Raises:
@@ -91,7 +91,7 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
 
 
 def schedule_name(schedule: Schedule) -> str:
-    """Return the name under which a schedule is written to the manifest."""
+    """Return the name that identifies a schedule in the manifest."""
     name = getattr(schedule, "__qualname__", None) or type(schedule).__qualname__
     return str(name)
 

@@ -51,12 +51,12 @@ class Session:
         policy_kwargs: extra arguments for the policy.
         schedule: the episodes that get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`. None means `cubic`, unless `monitor` has a `keep`.
-        placed_camera: members of a `mujoco.MjvCamera` by name, to be used instead of
-            `made.camera`. Only workers can draw from it.
+        placed_camera: fields of a `mujoco.MjvCamera`, keyed by name, used instead of
+            `made.camera`. Only workers can render from it.
         further_cameras: cameras for additional videos of the same episodes.
         made: options for creating the environment; the session sets `frames` and
             `seed`.
-        monitor: options for the monitor; the session sets the schedule and the policy's
+        monitor: options for the monitor; the session sets the schedule and the policy
             file.
     """
 
@@ -98,19 +98,19 @@ def record_session(
     """Record a session, and yield each episode as it ends.
 
     If the environment cannot be rendered here, only statistics are recorded, and the
-    log says why. If `render` requests videos, an error is raised instead.
+    log gives the reason. If `render` requests videos, an error is raised instead.
 
     The recordings are closed when the iterator ends, is closed, or raises. So make sure
-    to close the iterator, preferably with `contextlib.closing`. Only an iterator that
-    is exhausted waits for pending videos; otherwise they stay pending.
+    to close the iterator, preferably with `contextlib.closing`. The iterator waits
+    for pending videos only if it is exhausted; otherwise they stay pending.
 
     Args:
         session: the session's options.
         on_step: called after every step.
 
     Raises:
-        Error: the environment, policy, schedule, camera or directory is invalid. These
-            are checked before anything is written.
+        Error: the environment, policy, schedule, camera or directory is invalid. All of
+            this is checked before anything is written.
     """
     options = session.monitor
     _check(session)
@@ -125,7 +125,7 @@ def record_session(
         if named.not_drawn is not None:
             if options.render in (LIVE, DEFERRED):
                 raise named.not_drawn
-            logger.warning("No videos, only statistics. %s", named.not_drawn)
+            logger.warning("Recording only statistics, no videos. %s", named.not_drawn)
             schedule, options = disable_videos, replace(options, keep=None)
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
@@ -175,7 +175,7 @@ def record_session(
 
 
 def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisode]:
-    """Return the episodes of a finished session that used `keep`, with final videos.
+    """Return the episodes of a finished session that used `keep`, with their videos.
 
     `video` is None for each episode whose video was not kept.
 

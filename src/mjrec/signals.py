@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handlers that turn deadly signals into exceptions, so that files are closed."""
+"""Handlers that turn termination signals into exceptions, so that files are closed."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Terminated(SystemExit):
-    """A signal asked the process to end.
+    """The exception for a signal that asks the process to end.
 
-    Like KeyboardInterrupt, it leaves `with` blocks, runs `finally` clauses, and is not
+    Like KeyboardInterrupt, it unwinds `with` blocks and `finally` clauses, and is not
     caught by `except Exception`. If it is not caught, the exit status is 128 plus the
     signal's number.
 
@@ -85,7 +85,7 @@ def exiting_on_signals() -> Iterator[None]:
 
 
 def _deadly() -> list[signal.Signals]:
-    """Return the signals that would end the process at once."""
+    """Return the signals that would kill the process."""
     return [s for s in _SIGNALS if signal.getsignal(s) is signal.SIG_DFL]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timeouts for work that makes no progress and is then considered to hang."""
+"""Timeouts for work that is considered hung when it makes no progress."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def timeout_s() -> float:
 class Timeout:
     """A timeout that waits for progress in short slices.
 
-    A slice never counts for more than its planned duration. If the waiting process was
-    stopped, suspended or starved, the process that it waits for probably was too, and
-    that time does not count against it.
+    A slice never counts for more than its planned duration. If this process was
+    stopped, suspended or starved, the process that it waits for probably was too, so
+    the lost time does not count.
 
     ::
 

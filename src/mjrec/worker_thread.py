@@ -19,13 +19,13 @@ class WorkerThread(Generic[T]):
 
     The queue is bounded: `put` waits for room and never drops an item. An exception in
     the function is raised again in the caller's thread. The thread is a daemon, so it
-    never keeps the interpreter from exiting; only `close` guarantees that all items
+    never keeps the interpreter from exiting. Only `close` guarantees that all items
     were consumed.
 
     Args:
         consume: called with each item, always on the same thread.
         capacity: maximum number of waiting items.
-        name: the thread's purpose; `mjrec-` is added in front to form its name.
+        name: the thread's purpose; the thread's name is this with the prefix `mjrec-`.
         finish: called on the thread after the last item, but not after an error or
             `abort`.
 
@@ -44,8 +44,8 @@ class WorkerThread(Generic[T]):
         self._consume = consume
         self._finish = finish
         self._name = name
-        # These queues are reentrant, so a finalizer that a garbage collection runs in
-        # the middle of a call may call `leave`, and Ctrl-C leaves no lock held.
+        # These queues are reentrant: a finalizer that runs in the middle of a call may
+        # call `leave`, and Ctrl-C leaves no lock held.
         self._waiting: queue.SimpleQueue[tuple[T] | None] = queue.SimpleQueue()
         self._room: queue.SimpleQueue[None] = queue.SimpleQueue()
         for _ in range(capacity):
@@ -65,7 +65,7 @@ class WorkerThread(Generic[T]):
 
     @property
     def failed(self) -> bool:
-        """Whether the function has raised an error; then no more items are consumed."""
+        """Whether the function has raised an error. No more items are consumed then."""
         return self._error is not None
 
     def put(self, item: T) -> None:
@@ -88,7 +88,7 @@ class WorkerThread(Generic[T]):
                 raise ClosedError(f"{self._name} is closed.")
             self._waiting.put((item,))
         except BaseException:
-            # The next call must not wait for the room that this one took.
+            # The next call must not wait for the room that this call took.
             self._room.put(None)
             raise
 

@@ -20,15 +20,15 @@ from .overview import EXAMPLES, examples, overview, recordings_in
 
 __all__ = ["main"]
 
-# The module and the summary of each command. The module is imported when the command is
-# run, and its function has the module's name (`list_episodes`, because `list` is a
+# The module and the summary of each command. The module is imported when the command
+# runs, and its function has the module's name (`list_episodes`, because `list` is a
 # builtin).
 COMMANDS = {
     "record": ("record", "Record episodes of an environment."),
     "render": ("render", "Render pending videos, or rerender episodes."),
     "recover": ("recover", "Finish what a killed run left behind."),
     "list": ("list_episodes", "List recorded episodes."),
-    "strip": ("strip", "Put frames of an episode side by side."),
+    "strip": ("strip", "Put the frames of an episode side by side."),
     "replay": ("replay", "Show an episode in 3D, in one HTML file."),
     "view": ("view", "Watch a run in a browser while it is running."),
     "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
@@ -48,13 +48,13 @@ _INTERRUPTED = 130  # what shells report for a process that Ctrl-C ended
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status.
 
-    0 means success, 1 an error with one message on stderr, 130 an interruption by
-    Ctrl-C. As `SystemExit`: 2 for an invalid command line, 143 for SIGTERM, 129 for
-    SIGHUP. Files are closed first in all cases. Exceptions that are not mjrec's own
-    keep their traceback.
+    0 means success, 1 an error with one message on stderr, and 130 an interruption by
+    Ctrl-C. `SystemExit` is raised with 2 for an invalid command line, 143 for SIGTERM
+    and 129 for SIGHUP. Files are always closed first. Exceptions that are not mjrec's
+    own keep their traceback.
 
     Args:
-        argv: the arguments; by default those of the process.
+        argv: the arguments; None for those of the process.
     """
     with _warnings_on_stderr(), exiting_on_signals():
         return _run(argv)
@@ -84,8 +84,8 @@ def _run(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output has closed the pipe (`mjrec list DIR | head`).
-        # Flushing Python's buffer at exit would raise again.
+        # The program that reads our output has closed the pipe (`mjrec list DIR |
+        # head`). Flushing Python's buffer at exit would raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _FAILED
     return status
@@ -99,11 +99,11 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
-    """Return the arguments; the first one is a command.
+    """Return the arguments, the first of which is a command.
 
     Raises:
-        SystemExit: the command is unknown, it or its arguments are missing, or help or
-            the version was requested. A message has been printed.
+        SystemExit: the command is unknown or missing, its arguments are missing, or
+            help or the version was requested. A message has been printed.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if not given:
@@ -142,9 +142,9 @@ def _warnings_on_stderr() -> Iterator[None]:
 
 
 class _OnceInARun(logging.Filter):
-    """A filter that passes each kind of MuJoCo warning once, and one traceback.
+    """A filter that passes each kind of MuJoCo warning, and one traceback, only once.
 
-    Every worker logs its own copy, at its own time.
+    Every worker logs its own copy at a different time.
     """
 
     def __init__(self) -> None:

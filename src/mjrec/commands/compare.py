@@ -43,23 +43,23 @@ def compare(
 ) -> int:
     """Compare evaluations: how much better is B than A?
 
-    Compare two directories, mjrec compare A B, or several training runs on each side,
-    mjrec compare A... --against B... With several, each evaluation counts as one
+    Compare two directories (mjrec compare A B), or several training runs on each side
+    (mjrec compare A... --against B...). With several, each evaluation counts as one
     training run, represented by its mean return.
 
-    For each common task: both means, their difference B - A, the probability of
-    improvement (B's return is higher than A's), and the p-value of the Mann-Whitney
-    test, adjusted for the number of tasks (Holm). Across tasks: the mean probability
-    of improvement and the difference of the interquartile means of scores.
+    For each common task, the output shows both means, their difference B - A, the
+    probability of improvement (B's return is higher than A's), and the p-value of the
+    Mann-Whitney test, adjusted for the number of tasks (Holm). Across tasks, it
+    shows the mean probability of improvement and the difference between the IQMs.
 
     The exit status is 1 if a task cannot be compared (no completed episode, or NaN), or
     if a requirement of --require or --no-worse-than is not met. With either option, it
-    is also 1 if an episode of B failed (of A, for --no-worse-than B).
+    is also 1 if an episode of B failed (or of A, for --no-worse-than B).
 
     Args:
         a: A and B; with --against, the directories of A.
         against: the directories of B.
-        require: [TASK: ]FIGURE > NUMBER, also >=, < and <=, such as 'probability of
+        require: [TASK: ]FIGURE > NUMBER, or with >=, < or <=, such as 'probability of
             improvement > 0.75'. Figures across tasks: probability of improvement, IQM
             A, IQM B, IQM difference. Figures of TASK, or of each task: mean A, mean B,
             difference, paired difference, p-value. Append low or high to a figure for
@@ -70,14 +70,14 @@ def compare(
         confidence: confidence level of the intervals.
         resamples: bootstrap resamples.
         seed: seed of the bootstrap.
-        allow_nan: do not exit with 1 because of NaN or infinite returns.
+        allow_nan: do not exit with status 1 because of NaN or infinite returns.
         as_json: print one JSON object instead of text.
     """
     if not against:
         if len(a) != 2:
             raise InvalidArgument(
-                "Give two evaluations (mjrec compare A B) or two sets (mjrec compare "
-                f"A... --against B...); got {len(a)} without --against."
+                "Give two evaluations (mjrec compare A B), or two sets of evaluations "
+                f"(mjrec compare A... --against B...), not {len(a)} without --against."
             )
         a, against = a[:1], a[1:]
     if (no_worse_than is None) != (margin is None):
@@ -145,7 +145,7 @@ def _table(comparison: Comparison) -> rich.table.Table:
 def _cell(name: str, estimate: Estimate | None) -> str:
     if estimate is None:
         return ""
-    # The table has no room for the intervals of the means.
+    # The table has no room for the means' intervals.
     if name.startswith("mean"):
         return _number(estimate.value)
     return _estimate(estimate).replace(" (", "\n(")

@@ -20,11 +20,11 @@ def completion(
 ) -> int:
     """Print a shell completion script.
 
-    For bash, put this into ~/.bashrc: eval "$(mjrec completion bash)". For zsh, write
-    the output to a file named _mjrec in a folder on $fpath.
+    For bash, add this line to ~/.bashrc: eval "$(mjrec completion bash)". For zsh,
+    write the output to a file named _mjrec in a folder on $fpath.
 
     Args:
-        shell: which shell to complete for.
+        shell: the shell to complete for.
     """
     from . import COMMANDS
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec doctor`: whether this machine can record, and what to do if not."""
+"""`mjrec doctor`: check whether this machine can record, and explain what to fix."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DEEPER = 14
 
 @dataclasses.dataclass(frozen=True)
 class _Row:
-    """A name, its value, a remark after the value, and lines below."""
+    """A name, its value, a remark after the value, and the lines below it."""
 
     name: str
     value: str
@@ -33,7 +33,7 @@ class _Row:
 
 
 def doctor(*, json: bool = False) -> int:
-    """Check whether this machine can render, and show what to do if not.
+    """Check whether this machine can render, and explain what to do if it cannot.
 
     Renders a frame with each OpenGL backend, encodes a video with ffmpeg, and tries the
     simplest task of each package, in separate processes. The exit status is 0 if a
@@ -43,7 +43,7 @@ def doctor(*, json: bool = False) -> int:
         json: print one JSON object instead of text.
     """
     waiting = Console(stderr=True)
-    with waiting.status("Trying OpenGL, ffmpeg and the packages ..."):
+    with waiting.status("Testing OpenGL, ffmpeg and the packages ..."):
         report = examine_machine()
     if json:
         print_json(dataclasses.asdict(report))
@@ -53,7 +53,7 @@ def doctor(*, json: bool = False) -> int:
 
 
 def show_report(report: MachineReport, console: Console) -> None:
-    """Print `report` for people."""
+    """Print `report` in human-readable form."""
     sections = {
         "OpenGL": [*map(_probe, report.backends), *_choice(report)],
         "ffmpeg": [_ffmpeg(report.ffmpeg)],

@@ -92,40 +92,40 @@ def evaluate(
             dm_control:all, dm_control:easy, dm_control:hard, dm_control:extra,
             gymnasium:mujoco), or quoted patterns ('dm_control/walker-*').
         policy: random, zero, module:name, module:name() or a file, as in mjrec record.
-        out: the evaluation's directory, empty or new.
-        episodes: episodes per task and seed. By default 10.
-        num_seeds: number of seeds, counting from 0. By default 5.
-        workers: worker processes. By default one per CPU. Results do not depend on
+        out: the evaluation's directory, which must be empty or new.
+        episodes: episodes per task and seed. Default: 10.
+        num_seeds: number of seeds, counting from 0. Default: 5.
+        workers: worker processes. Default: one per CPU. Results do not depend on
             this number. With --engine, the number of engine workers.
         seeds: the seeds, such as 0,1,2 or 0-99, instead of --num-seeds.
         keep: which episodes of each task get a video: best, best:N, median, worst,
-            worst:N, failures, failures:N, joined by commas; or cubic, all or none. By
-            default best,median,worst.
-        protocol: seeded starts episode i of seed s from NumPy's SeedSequence([s, i]);
-            suite has one random stream per task and seed, seeded with s. By default
-            seeded.
+            worst:N, failures, failures:N, joined by commas; or cubic, all or none.
+            Default: best,median,worst.
+        protocol: with seeded, episode i of seed s starts from NumPy's SeedSequence([s,
+            i]); with suite, each task and seed has one random stream, seeded with s.
+            Default: seeded.
         resume: continue the evaluation in the directory without repeating finished
-            work. Options that you do not give keep their values. You may add tasks,
+            work. Options that you omit keep their values. You may add tasks,
             seeds and episodes.
         force: delete the evaluation in the directory first.
-        max_steps: truncate episodes after this many steps. By default the
+        max_steps: truncate episodes after this many steps. Default: the
             environment's limit, or 1000.
         episode_timeout: seconds after which an episode counts as failed.
-        camera: name or number. By default the model's tracking camera, if it has one.
+        camera: name or number. Default: the model's tracking camera, if it has one.
         size: size of the videos, WIDTHxHEIGHT in pixels.
-        max_fps: maximum frames per second of simulated time. By default 60.
+        max_fps: maximum frames per second of simulated time. Default: 60.
         quality: full, or draft (several times faster, with coarser edges and shadows).
-            By default full.
+            Default: full.
         env_kwargs: arguments for each environment, as a JSON object.
         policy_kwargs: arguments for the policy, as a JSON object.
-        score_range: TASK=LOW:HIGH, the returns that count as scores 0 and 1 across
-            tasks. dm_control tasks have their own. May be repeated.
-        fail_under: TASK=VALUE: exit with 1 if the task's mean return is lower or one
-            of its episodes failed. TASK may be a pattern. May be repeated.
-        allow_nan: do not exit with 1 because of NaN or infinite returns.
+        score_range: TASK=LOW:HIGH, the returns that count as scores of 0 and 1 across
+            tasks. dm_control tasks have known ranges. May be repeated.
+        fail_under: TASK=VALUE: exit with status 1 if the task's mean return is lower or
+            one of its episodes failed. TASK may be a pattern. May be repeated.
+        allow_nan: do not exit with status 1 because of NaN or infinite returns.
         confidence: confidence level of the intervals.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where episodes and videos are computed, if not in this command's
+        engine_options: where to compute episodes and videos, if not in this command's
             own processes.
     """
     height, width = size_of(size)
@@ -217,7 +217,7 @@ def _shown_progress(
 def _tasks_and_directory(
     tasks: tuple[str, ...], out: Path | None, *, resume: bool
 ) -> tuple[tuple[str, ...], Path]:
-    """Return the tasks and the directory; `--resume DIR` names only the latter."""
+    """Return the tasks and the directory; `--resume DIR` gives only the latter."""
     if out is None and resume and tasks and (Path(tasks[-1]) / PLAN_NAME).is_file():
         return tasks[:-1], Path(tasks[-1])
     if out is None:
@@ -228,7 +228,7 @@ def _tasks_and_directory(
 
 
 def _matching(least: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
-    """Return the required value of each task; a pattern sets it for all that match.
+    """Return each task's required value; a pattern sets it for all matching tasks.
 
     Raises:
         UnknownName: no task matches one of the patterns.
@@ -247,7 +247,7 @@ def _matching(least: Mapping[str, float], names: Sequence[str]) -> dict[str, flo
 def _by_task(
     option: str, given: Sequence[str], read: Callable[[str], T], form: str
 ) -> dict[str, T]:
-    """Return the values of repeated TASK=... options, by task.
+    """Return the values of repeated TASK=... options, keyed by task.
 
     Raises:
         InvalidArgument: an option does not have the form `form`.
@@ -295,7 +295,7 @@ def _seeds_of(text: str) -> list[int]:
 def _shortfalls(
     evaluation: Evaluation, least: Mapping[str, float]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the tasks that miss their required value, and why."""
+    """Yield each task that misses its required value, and the reason."""
     for task, value in least.items():
         summary = evaluation.summary(task)
         if summary.failed:

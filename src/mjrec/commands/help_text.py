@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Help texts: the docstrings of commands, as they are shown in a terminal."""
+"""Help texts: the docstrings of commands, as shown in a terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ C = TypeVar("C", bound=Callable[..., object])
 # The continuation lines of an argument's description in a Google-style docstring.
 _CONTINUATION = re.compile(r"\n {12,}(?=\S)")
 _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
-# How all commands are parsed: flags have no --no-... twin, and "None" is not a value.
+# How all commands are parsed: flags have no --no-... form, and "None" is not a value.
 PARSING = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
 
 
@@ -23,9 +23,9 @@ def flowing_help(command: C) -> C:
     """Prepare an object's docstring and signature for tyro; return the object.
 
     The object is a command, or a class of options that several commands share. Lines of
-    a description are joined: tyro would break it where the docstring does, and again at
-    the edge of the terminal. Defaults that the description explains (None), or that go
-    without saying (an option that is not given), are not repeated after it.
+    a description are joined, because tyro would otherwise break it where the docstring
+    does and again at the edge of the terminal. Defaults that the description explains
+    (None) or that are obvious (an omitted option) are not repeated after it.
     """
     command.__doc__ = _CONTINUATION.sub(" ", command.__doc__ or "")
     hints = get_type_hints(command, include_extras=True)

@@ -40,8 +40,8 @@ def list_episodes(
 ) -> int:
     """List the episodes of a monitor directory or an evaluation.
 
-    For an evaluation, finished or not: the task, seed, return and video of each
-    episode. For a folder that only contains monitor directories, the episodes of each.
+    For an evaluation, finished or not, list the task, seed, return and video of each
+    episode. For a folder that only contains monitor directories, list all episodes.
 
     Args:
         directory: a monitor directory, an evaluation, or a folder of monitor
@@ -113,7 +113,7 @@ def _end(terminated: bool | None) -> str:
 
 
 def _print_monitors(directory: Path) -> None:
-    # The names of the videos that each show one completed episode.
+    # The names of the videos that show exactly one completed episode.
     known: set[str] = set()
     best: list[Episode] = []
     # Sub-environments of a vector environment number their episodes separately.
@@ -143,7 +143,7 @@ def _print_monitors(directory: Path) -> None:
         of = f" of {episode.monitor}" if has_several else ""
         what = f"episode {episode.episode_id}{of}, {_return(episode.reward)}"
         sys.stdout.write(f"Best return: {printable(what)}\n")
-    # For example clips, and videos that show all sub-environments.
+    # For example, clips, and videos that show all sub-environments.
     others = [path.name for path in _videos(directory) if path.name not in known]
     if others:
         sys.stdout.write("\n  ".join(["Other videos:", *others]) + "\n")
@@ -164,7 +164,7 @@ def _fields(episode: Episode) -> dict[str, Any]:
 
 
 def _further_videos(episode: Episode) -> list[str]:
-    """Return the names of an episode's videos from its other cameras."""
+    """Return the names of an episode's videos from its additional cameras."""
     if episode.video is None or episode.metadata is None:
         return []
     return [name for name, _ in finished_videos(episode.video)[1:]]

@@ -24,7 +24,7 @@ _LOCAL = "local"
 
 
 def size_of(text: str | None) -> tuple[int | None, int | None]:
-    """Return `(height, width)` of WIDTHxHEIGHT; `(None, None)` for None.
+    """Return `(height, width)` for WIDTHxHEIGHT; `(None, None)` for None.
 
     Raises:
         InvalidArgument: `text` is not a valid size.
@@ -45,11 +45,11 @@ def number_or_name(text: str) -> str | int:
 
 
 def camera_of(text: str | None) -> PlainCamera | None:
-    """Return a camera: a number, a name, or members of an `MjvCamera` from JSON.
+    """Return a camera: a number, a name, or fields of an `MjvCamera` from JSON.
 
     Raises:
-        InvalidArgument: the JSON is invalid, or a member's value is.
-        UnknownName: a member does not exist.
+        InvalidArgument: the JSON or the value of a field is invalid.
+        UnknownName: there is no such field.
     """
     if text is None:
         return None
@@ -82,7 +82,7 @@ def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
 @flowing_help
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """Where the work runs.
+    """Options for where the work runs.
 
     Attributes:
         engine: local (processes on this machine), ray, slurm, or dask:ADDRESS (a
@@ -91,7 +91,7 @@ class EngineOptions:
         gpus: fraction of a GPU per worker; with 0.25, four workers share one.
         require_gpu: fail if a worker would render in software.
         address: the Ray cluster's address: HOST:PORT, or auto for the one on this
-            machine. By default RAY_ADDRESS, otherwise a cluster started for this
+            machine. Default: RAY_ADDRESS, otherwise a cluster started for this
             command.
         engine_option: KEY=VALUE, an engine-specific option, such as partition=gpu for
             Slurm. May be repeated.

@@ -65,10 +65,10 @@ def examples(command: str) -> str:
 
 
 def recordings_in(directory: Path) -> str:
-    """Return a summary of the recordings in a directory, and useful commands for them.
+    """Return a summary of the recordings in a directory, and commands for using them.
 
-    The directory and two levels below it are searched. The summary is empty if nothing
-    is found, or if a directory cannot be listed.
+    The directory and the two levels below it are searched. The summary is empty if
+    nothing is found, or if a directory cannot be listed.
     """
     try:
         places = list(itertools.islice(_places(directory, 2), _MOST_SHOWN + 1))
@@ -97,7 +97,7 @@ def recordings_in(directory: Path) -> str:
 
 def _places(directory: Path, levels: int) -> Iterator[Path]:
     """Yield the evaluations and monitor directories at and below a directory."""
-    # Imported here so that the list of commands appears at once.
+    # Imported late so that the list of commands appears immediately.
     from ..evaluation.evaluation import is_evaluation
     from ..formats.monitor_directory import iter_monitor_files
 
@@ -110,7 +110,7 @@ def _places(directory: Path, levels: int) -> Iterator[Path]:
 
 
 def _summary(directory: Path) -> tuple[str, bool]:
-    """Return a summary of a directory, and whether a video is pending."""
+    """Return a summary of a directory, and whether it has pending videos."""
     from ..errors import Error
     from ..evaluation.evaluation import is_evaluation, results_in
     from ..plain_text import counted

@@ -36,19 +36,19 @@ def pack(
 ) -> int:
     """Pack recordings into one file that others can verify.
 
-    The zip file is a BagIt bag around an RO-Crate: recordings, statistics as CSV,
-    versions and machine, a README and a CITATION.cff. The same recordings give the
+    The zip file is a BagIt bag around an RO-Crate with the recordings, statistics as
+    CSV, versions and machine, a README and a CITATION.cff. The same recordings give the
     same bytes. Readers check it with mjrec verify.
 
     Args:
         directory: a monitor directory, or one with several, such as an evaluation.
-        out: the archive: a new file whose name ends in .zip.
+        out: the archive, a new file whose name ends in .zip.
         author: "Name", "Name <address>" or "Name <ORCID>". May be repeated.
-        license: SPDX identifier of the licence, such as CC-BY-4.0, or its URL.
-        title: title of the run. By default, derived from what was recorded.
-        anonymous: remove everything that names a user, a machine or an author.
+        license: SPDX identifier of the license, such as CC-BY-4.0, or its URL.
+        title: title of the run. Default: derived from the recordings.
+        anonymous: remove everything that identifies a user, a machine or an author.
         episodes: pack videos and states of these episodes only, such as 0,8,27. The
-            archive says so.
+            archive records this choice.
         max_size: size limit, such as 50M. If needed, videos are rerendered at a
             smaller size.
     """

@@ -64,38 +64,38 @@ def record(
             with the environment), module:name() (called with the environment; returns
             the policy), or a file you trust: model.zip from Stable-Baselines3,
             TorchScript (.pt), ONNX (.onnx).
-        seed: S; episode i starts from NumPy's SeedSequence([S, i]). By default a new
+        seed: S; episode i starts from NumPy's SeedSequence([S, i]). Default: a new
             seed, which is printed.
         size: size of the videos, WIDTHxHEIGHT in pixels.
-        max_steps: truncate episodes after this many steps. By default the
+        max_steps: truncate episodes after this many steps. Default: the
             environment's limit, or 1000.
         camera: name or number, or a free camera as JSON ('{"distance": 3, "azimuth":
-            90}'). By default the model's tracking camera, if it has one. Repeat the
+            90}'). Default: the model's tracking camera, if it has one. Repeat the
             option to get a video from each camera.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
-            all, none, every:N or at:0,5,9. By default cubic.
+            all, none, every:N or at:0,5,9. Default: cubic.
         keep: choose the videos after the episodes have ended: best:N or worst:N (by
             return), failures, failures:N (the first N) or median. Other recordings
             are deleted.
         force: delete the recordings in the directory first.
         resume: add to the recordings in the directory.
         quality: full, or draft (several times faster, with coarser edges and shadows).
-        workers: processes that render deferred videos. By default one per CPU. 0
+        workers: processes that render deferred videos. Default: one per CPU. 0
             renders nothing now and needs no OpenGL; mjrec render DIR does it later.
         render: deferred saves states and renders in worker processes; live renders
-            while the simulation runs; off makes no videos. By default deferred if
+            while the simulation runs; off makes no videos. Default: deferred if
             the frames are known to be the same, otherwise live.
         max_fps: maximum frames per second of simulated time. Steps in between are left
-            out of the video; the last step never is.
-        fps: frames per second written into the videos. By default real time.
+            out of the video; the last step is always kept.
+        fps: frames per second written into the videos. Default: real time.
         tiled: one video with all cameras side by side.
         annotate: write episode, step, time and return on the frames.
-        name_prefix: also name the videos as Gymnasium's RecordVideo does:
+        name_prefix: also name the videos in the style of Gymnasium's RecordVideo:
             PREFIX-episode-27.mp4.
         env_kwargs: arguments for the environment, as a JSON object.
         policy_kwargs: arguments for the policy's class, factory or file loader, as a
             JSON object.
-        allow_nan: do not exit with 1 because of NaN or infinite returns.
+        allow_nan: do not exit with status 1 because of NaN or infinite returns.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)

@@ -28,9 +28,9 @@ def recover(
     """Finish what a killed recording or rendering left in a directory.
 
     Live videos get their final names, logs become trajectories, and the statistics and
-    manifest are rebuilt from the journal. Anything that was cut off is marked
+    manifest are rebuilt from the journal. Recordings that were cut off are marked
     incomplete. Files of running processes are not touched. Deferred videos stay
-    pending: render them with mjrec render DIR.
+    pending; render them with mjrec render DIR.
 
     Args:
         directory: a monitor directory or an evaluation.
@@ -46,7 +46,7 @@ def recover(
 
 
 def _recover_all(directory: Path, timeout: float) -> Recovery:
-    """Recover a directory; for an evaluation, also the monitor directories in it."""
+    """Recover a directory and, for an evaluation, the monitor directories in it."""
     recovery = recover_directory(directory, timeout=timeout)
     for below in monitor_directories_in(directory) if is_evaluation(directory) else ():
         found = recover_directory(below, timeout=timeout, bundle=True)

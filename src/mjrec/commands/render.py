@@ -46,41 +46,41 @@ def render(
 ) -> int:
     """Render pending videos, or rerender recorded episodes.
 
-    Without options, all pending videos of the directory are rendered as planned.
-    Several such commands running on one directory share the work.
+    Without options, all pending videos in the directory are rendered as planned.
+    Several such commands can run on one directory and share the work.
 
-    With an option that changes the video (--camera, --size, --quality, --out and the
-    like), recorded episodes are rendered again, into new files next to the originals:
-    openaigym.video.<...>.video000027.side.mp4. An episode with several cameras gives
-    one video: from --camera if given, otherwise from the first camera, or tiled if it
-    was recorded tiled.
+    With an option that changes the video (such as --camera, --size, --quality or
+    --out), recorded episodes are rendered again, into new files next to the originals:
+    openaigym.video.<...>.video000027.side.mp4. For an episode with several cameras, the
+    result is one video: from --camera if given, otherwise from the first camera, or
+    tiled if it was recorded tiled.
 
     Args:
         target: a monitor directory or an evaluation; or one of their trajectories or
-            videos, for that episode only.
-        episode: number of the episode. By default all recorded ones. In an evaluation,
-            the episode with that number for every task and seed.
+            videos, to render only that episode.
+        episode: number of the episode. Default: all recorded ones. In an evaluation,
+            the episode with that number for every task and seed is rendered.
         camera: name or number, or a free camera as JSON, such as '{"distance": 3,
-            "azimuth": 90, "elevation": -20, "lookat": [0, 0, 1]}'. By default as
+            "azimuth": 90, "elevation": -20, "lookat": [0, 0, 1]}'. Default: as
             recorded, like the options below.
         size: WIDTHxHEIGHT in pixels.
         quality: full (the model's own settings) or draft (several times faster).
-        workers: processes that render. By default one per free CPU. With --engine, the
+        workers: processes that render. Default: one per free CPU. With --engine, the
             number of engine workers.
-        out: the file to write, for one episode. Its suffix chooses the format.
+        out: the file to write, for one episode. Its suffix determines the format.
         max_fps: maximum frames per second of simulated time: every n-th recorded frame
             and the last one are drawn.
         fps: frames per second written into the file. It does not select frames.
         annotate: write episode, step, time and return on the frames.
         no_annotate: leave out the recorded captions.
-        pending: render the pending videos only. This is the default.
-        strict: fail if a video shows nothing (black, one colour, no movement). The
+        pending: render only the pending videos. This is the default.
+        strict: fail if a video shows nothing (black, one color, no movement). The
             video is kept.
         trust_models: load compiled models that another user or machine wrote. Needed
             if their sources are missing. A crafted model can run any code, so
             use it only if you trust the author.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where the work runs, if not in this command's own processes.
+        engine_options: where to run the work, if not in this command's own processes.
     """
     height, width = size_of(size)
     if annotate and no_annotate:
@@ -98,12 +98,12 @@ def render(
     if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
             "--pending renders videos as planned. To render an episode differently, "
-            "omit it."
+            "omit --pending."
         )
     places, number = _places(target, episode)
     if out is not None and len(places) > 1:
         raise InvalidArgument(
-            f"--out is for one episode, and {target} has several: name its trajectory "
+            f"--out is for one episode, but {target} has several. Give a trajectory "
             "(openaigym.trajectory.*.h5)."
         )
     engine = engine_options.chosen(workers)
@@ -130,7 +130,7 @@ def render(
     if nothing and (episode is not None or not target.is_dir()):
         what = target.name if episode is None else f"episode {episode}"
         raise InvalidArgument(
-            f"No video of {what} is pending. To render it again, say what should "
+            f"No video of {what} is pending. To render it again, specify what should "
             "change (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
             "where to write it (--out)."
         )
@@ -175,7 +175,7 @@ def _collect(
     """Print each finished video, and collect the results.
 
     Returns:
-        The results, and whether Ctrl-C came before the end.
+        The results, and whether Ctrl-C interrupted the rendering.
     """
     done = []
     try:

@@ -31,9 +31,9 @@ def replay(
 
     Args:
         target: a trajectory (openaigym.trajectory.*.h5) or a monitor directory.
-        episode: number of the episode, if the target is a directory. By default the
+        episode: number of the episode, if the target is a directory. Default: the
             last one.
-        max_fps: maximum states per second of simulated time. By default all.
+        max_fps: maximum states per second of simulated time. Default: all.
         out: the page to write. An existing file is replaced.
         trust_models: load compiled models that another user or machine wrote. A crafted
             model can run any code, so use it only if you trust the author.

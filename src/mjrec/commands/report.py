@@ -32,20 +32,20 @@ def report(
 ) -> int:
     """Make a web page from recordings: figures, curves, videos and their provenance.
 
-    The result is a folder with index.html and copies of the videos. It opens from disk
-    without a network; making it needs neither MuJoCo nor OpenGL. Directories from old
-    gym work too. Unreadable files are named on the page.
+    The result is a folder with index.html and copies of the videos. The page opens from
+    disk without a network; creating it requires neither MuJoCo nor OpenGL. Directories
+    written by old versions of gym work too. Unreadable files are listed on the page.
 
     Args:
         directories: evaluations, monitor directories, or folders that contain them.
         out: the folder to write. An existing report is replaced; any other non-empty
             folder is left alone.
-        single_file: put images and videos into the page itself. --out may then name
+        single_file: embed images and videos in the page itself. --out may then name
             the page.
         max_single_file_bytes: size limit of that page. Videos that do not fit are left
             out, with a note.
         replay: add a 3D page next to the videos of the best, median and worst episodes.
-            It needs MuJoCo, and is loaded only when opened.
+            Creating that page requires MuJoCo. It is loaded only when opened.
         title: title of the page.
         verification: output of mjrec verify --json. May be repeated. A
             verification.json in a directory is found automatically.

@@ -28,16 +28,16 @@ def strip(
 ) -> int:
     """Put frames of an episode side by side, with their times.
 
-    Frames are evenly spaced, including the first and the last. From a trajectory they
-    are rendered, at any size and from any camera; from a video they are decoded.
+    Frames are evenly spaced and include the first and the last. They are rendered from
+    a trajectory, at any size and from any camera, or decoded from a video.
 
     Args:
         file: a trajectory (openaigym.trajectory.*.h5) or a video.
         out: the PNG to write.
         frames: number of frames.
         size: WIDTHxHEIGHT of each frame in pixels (trajectories only).
-        camera: name or number (trajectories only). By default as recorded.
-        columns: frames per row. By default up to eight.
+        camera: name or number (trajectories only). Default: as recorded.
+        columns: frames per row. Default: up to eight.
         quality: full (the model's own settings) or draft (trajectories only).
         as_json: print one JSON object at the end.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Printing for people, on a terminal or in a log, and for programs."""
+"""Output for people, on a terminal or in a log, and for programs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import rich.table
 
 from .. import json_text
 
-# Exit statuses. The second is what shells report for a process that Ctrl-C ended.
+# Exit statuses. The second is what shells report for a process ended by Ctrl-C.
 FAILED, INTERRUPTED = 1, 130
 
 _LOG_WIDTH = 160
-# The number of rows from which the column widths of a long table are measured.
+# The number of rows that determine the column widths of a long table.
 _ROWS_MEASURED = 1000
 
 
@@ -26,7 +26,7 @@ def result_console() -> rich.console.Console:
     console = rich.console.Console()
     if console.is_terminal:
         return console
-    # A log has no width of its own, and a wrapped name cannot be copied.
+    # A log has no width, and a wrapped name cannot be copied.
     return rich.console.Console(width=_LOG_WIDTH)
 
 
@@ -39,7 +39,7 @@ def printable(text: str) -> str:
 
 
 def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
-    """Group names by their reason."""
+    """Group names by reason."""
     names: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         names.setdefault(reason, []).append(name)
@@ -71,12 +71,12 @@ def table(names: Iterable[str]) -> rich.table.Table:
 def print_rows(
     names: Sequence[str], rows: Iterator[Sequence[str]], *, left: Sequence[str]
 ) -> bool:
-    """Print a table of any length, keeping only its beginning in memory.
+    """Print a table of any length, keeping only its first rows in memory.
 
     Args:
         names: the column names.
         rows: the cells of each row, which may contain untrusted text.
-        left: names of the text columns, which are left-aligned; the others hold
+        left: names of the text columns, which are left-aligned; all others contain
             numbers.
 
     Returns:

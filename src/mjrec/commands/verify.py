@@ -44,14 +44,14 @@ def verify(
     The archive may come from a stranger: it is read, run and compared in
     resource-limited processes without network or home directory, and no code that it
     names is executed. The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing
-    contradicts the archive, but something had to be taken on trust) or 1 (FAIL).
+    contradicts the archive, but some items had to be trusted) or 1 (FAIL).
 
     Args:
         path: an archive made by mjrec pack, an unpacked one, a monitor directory, or a
             directory with several, such as an evaluation.
-        level: where to stop. files checks the bag; stats also rewards, ends, statistics
-            and the selection of episodes; physics also all states; pixels also all
-            frames and files.
+        level: how far to check. files checks the bag; stats also checks rewards,
+            episode ends, statistics and the selection of episodes; physics also checks
+            all states; pixels also checks all frames and files.
         report: write an HTML page about the result to this file.
         sample: check only this many frames of each video.
         allow: accept an excuse, by name and value, such as "gl=NVIDIA H100". May be
@@ -60,7 +60,7 @@ def verify(
         trust: id of an environment that may be created even though it is not in
             Gymnasium's or dm_control's registry. This runs code that you have
             installed. May be repeated.
-        seed: seed for --sample. By default a random one, which is printed.
+        seed: seed for --sample. Default: a random one, which is printed.
         as_json: print one JSON object instead of text.
     """
     with progress_bar(rich.console.Console(stderr=True)) as show:
@@ -94,7 +94,7 @@ def show_verification(
     Args:
         verification: the verification to print.
         console: the console to print to.
-        verbose: list all findings, and the software and machine it was verified with.
+        verbose: list all findings, and the software and machine used for verification.
     """
     most = None if verbose else _MOST_SHOWN
     verdict = f"[bold]{_styled(str(verification.verdict))}[/]"

@@ -19,14 +19,14 @@ def view(
 ) -> int:
     """Watch a run in a browser while it is running.
 
-    Shows the latest states in 3D, returns and episodes. Prints an address on this
-    machine, with a token that the browser needs, and serves it until Ctrl-C. It only
-    reads, at low priority, and never blocks the run. From another machine, forward the
-    port: ssh -L PORT:127.0.0.1:PORT HOST.
+    Shows the latest states in 3D, and the returns and episodes. Prints an address on
+    this machine, including a token that the browser needs, and serves it until Ctrl-C.
+    The command only reads, at low priority, and never blocks the run. From another
+    machine, forward the port: ssh -L PORT:127.0.0.1:PORT HOST.
 
     Args:
         directory: a monitor directory, or one with several, such as an evaluation.
-        port: port to listen on. By default a free one.
+        port: port to listen on. Default: a free one.
         trust_models: load compiled models that another user or machine wrote. A crafted
             model can run any code, so use it only if you trust the author.
     """

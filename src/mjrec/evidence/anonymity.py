@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings without the names of the people and machines that made them.
+"""Removal of the names of people and machines from recordings.
 
 In a staged monitor directory, whose files are copies or links:
 
 - strings in JSON (manifests, metadata, statistics, journals, text recordings), in
   trajectories' facts and in Stable-Baselines3's CSV get placeholders: `<home>`,
   `<path>`, `<user>`, `<host>`;
-- a recording's provenance keeps only the file names of its command line, loses the
-  code's commit and location, and has no directories in its variables;
-- the device that rendered a video keeps only its index, and UUIDs of GPUs become
+- in a recording's provenance, the command line is reduced to file names, the code's
+  commit and location are removed, and so are directories in variables;
+- of the device that rendered a video, only the index is kept, and UUIDs of GPUs become
   `<gpu>`, because each identifies a single card;
-- file names that contain the identity in a uid, a camera or a prefix get `user` or
-  `host` instead, and references to them are changed to match;
-- sources of models lose their comments, and their images lose their metadata. No
-  element or attribute changes, so the model compiles to the same result, and names
-  stay;
+- in file names, an identity in a uid, a camera or a prefix becomes `user` or `host`,
+  and references to these files are changed to match;
+- comments are removed from the sources of models, and metadata from their images. No
+  element or attribute changes, so the model compiles to the same result, and names are
+  kept;
 - a compiled model that contains the identity is removed. Only its author could have
   loaded it.
 
-`identity_matching` defines the matching. Times and numbers stay, including the process
-id in a default uid. Any other trace of the identity stays too, for example in a body's
-name; `remaining_identity` finds it.
+`identity_matching` defines the matching. Times and numbers are kept, including the
+process id in a default uid. Any other trace of the identity remains, for example in a
+body's name; `remaining_identity` finds such traces.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _MODEL = f"{FILE_PREFIX}.model."
 # System directories are the same on every machine.
 _SHARED = r"(?!(?:usr|bin|sbin|lib|lib64|opt|etc|proc|sys|dev)(?:/|$))"
 _DIRECTORY = re.compile(rf"(?<![\w./])/{_SHARED}[^\s\"':,;<>=]+")
-# Only what is certainly a path: `dm_control/cheetah-run` is not.
+# Only text that is certainly a path, which `dm_control/cheetah-run` is not.
 _PATH_OF_FILE = re.compile(
     r"(?<![\w.-])(?:[/~]|\.\.?/)[^\s\"':,;<>=]*|[^\s\"':,;<>=]*/[^\s\"':,;<>=/]*\.\w+"
 )
@@ -69,7 +69,7 @@ _CODE = {"remote": None, "root": "<path>", "commit": "<commit>"}
 _BESIDE_THE_MODEL = re.compile(
     r"(?P<cdata><!\[CDATA\[.*?\]\]>)|<!--(?P<comment>.*?)-->", re.DOTALL
 )
-# Licences require that these comments be kept.
+# Licenses require that these comments be kept.
 _LICENCE = re.compile(r"copyright|licen[cs]e|\(c\)|©", re.IGNORECASE)
 _MAIL = re.compile(r"@[\w-]+\.\w")
 
@@ -131,14 +131,14 @@ class _Texts:
         return self._matcher.replaced_in_name(self._with_new_infixes(name))
 
     def text(self, text: str) -> str:
-        """Return a string without the identity."""
+        """Return a string with the identity removed."""
         is_of_monitor = text.startswith(f"{FILE_PREFIX}.")
         if is_second_name(text) or (is_of_monitor and not re.search(r"[/\s]", text)):
             return self.name(text)
         return self._matcher.replaced(self._with_new_infixes(text))
 
     def value(self, value: Any) -> Any:
-        """Return a JSON value without the identity."""
+        """Return a JSON value with the identity removed."""
         match value:
             case str():
                 return self.text(value)
@@ -153,7 +153,7 @@ class _Texts:
                 return value
 
     def json(self, data: bytes) -> bytes:
-        """Return JSON without the identity; the same bytes if nothing changes."""
+        """Return JSON with the identity removed; the same bytes if nothing changes."""
         value = loads(data)
         new = self.value(value)
         return data if new == value else dumps(new).encode()
@@ -214,7 +214,7 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 
 def _general(key: str, value: Any) -> Any:
-    """Return a JSON key's value without what identifies a person or a machine."""
+    """Return a JSON key's value without traces of a person or a machine."""
     if key == "provenance" and isinstance(value, dict):
         return {k: _general_provenance(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):
@@ -253,7 +253,7 @@ def _without_directories(argument: Any) -> Any:
 
 
 def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str, str]:
-    """Return the new infixes of monitors whose old ones contain the identity."""
+    """Return the new infixes of monitors whose old infixes contain the identity."""
     old = sorted({infix for name in names if (infix := infix_of(name)) is not None})
     taken = {infix for infix in old if matcher.replaced_in_name(infix) == infix}
     new: dict[str, str] = {}
@@ -274,8 +274,8 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
 def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
     """Return the zip file of a model's sources, without comments and metadata.
 
-    Comments that mention a licence stay, unless they contain the identity or an email
-    address.
+    Comments that mention a license are kept, unless they contain the identity or an
+    email address.
 
     Args:
         content: the bytes of the zip file.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opening the input of a verification: a packed run, its folder, or recordings.
 
-The input is untrusted, so this runs in a sandbox. Everything is brought into a folder
-inside the sandbox, laid out like a packed run; only regular files are accepted.
+The input is untrusted, so this module copies or unpacks it into a folder in a sandbox,
+laid out like a packed run. Only regular files are accepted.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _CHUNK = 1 << 20
 # Bytes to leave free on the disk for other programs.
 _ROOM = 1 << 26
 
-# zipfile raises RuntimeError for an encrypted file, NotImplementedError for methods and
-# versions that it does not know.
+# zipfile raises RuntimeError for an encrypted file, and NotImplementedError for unknown
+# methods and versions.
 _NOT_READ = (
     *(ValueError, zipfile.BadZipFile, zlib.error, EOFError),
     *(RuntimeError, NotImplementedError, MemoryError),
@@ -106,7 +106,7 @@ def _copy_in(path: Path, into: Path) -> str:
     recordings: dict[str, Path] = {}
     for place in recording_directories(path):
         for file in iter_monitor_files(place):
-            # Models are named by their content, so two monitors may share one.
+            # Models are named after their content, so two monitors may share one.
             if recordings.setdefault(file.name, file) != file and infix_of(file.name):
                 raise UnreadableArchive(path, f"{file.name} is in two of its folders")
     if not recordings:
@@ -123,7 +123,7 @@ def _copy_in(path: Path, into: Path) -> str:
 def _bag_in(path: Path) -> Path | None:
     if (path / BAG_DECLARATION).exists():
         return path
-    # The result of `unzip`.
+    # The folder that `unzip` creates.
     inside = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     if len(inside) == 1 and (inside[0] / BAG_DECLARATION).exists():
         if inside[0].is_symlink():
@@ -173,8 +173,8 @@ def _copy_files(files: Mapping[str, Path], into: Path, *, given: Path) -> None:
 def _unpack(path: Path, into: Path) -> None:
     """Unpack a zip file's only folder.
 
-    Files are streamed to the disk and counted on the way: an archive that contains more
-    than it declares is refused at the first extra byte.
+    Files are streamed to the disk and their bytes are counted. An archive that contains
+    more than it declares is rejected at the first extra byte.
     """
     with open_plain_zip(path) as archive:
         top, infos = top_folder(archive), in_order(archive)

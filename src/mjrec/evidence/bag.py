@@ -2,12 +2,12 @@
 """BagIt bags (RFC 8493): writing and checking them, and packing a folder as a zip file.
 
 The bag's files are written here because `bagit.make_bag` writes version 0.97, in
-directory order, and changes the working directory of the whole process. The tests
-validate them with that package.
+directory order, and changes the working directory of the whole process. The tests use
+that package to validate the bags.
 
 The zip file is reproducible byte for byte: its order, times, modes and system are
-fixed, and owners are left out. Files that are compressed already are stored; the others
-are deflated, with the same result for the same version of zlib.
+fixed, and owners are left out. Files that are already compressed are stored. All others
+are deflated, which gives the same result with the same version of zlib.
 
 Bags are checked strictly: every file must be listed in a manifest, and every listed
 file must exist.
@@ -31,7 +31,7 @@ from .findings import Finding, Outcome, Topic
 from .layout import FORMAT_KEY, FORMAT_VERSION, PAYLOAD
 from .portable_names import check_distinct, portable_parts
 
-# Extensions of files that are compressed already.
+# Extensions of files that are already compressed.
 STORED = (".mp4", ".avi", ".h5", ".gz", ".zip")
 # Advice for a full disk.
 TRY_AGAIN = "then pack again"
@@ -61,7 +61,7 @@ _OnProgress = Callable[[int, int], object]
 
 
 def bag_tags(folder: Path, *, date: str, title: str) -> dict[str, str]:
-    """Return the contents of a bag's tag files, by file name.
+    """Return the contents of a bag's tag files, keyed by file name.
 
     Args:
         folder: the bag's folder, with its payload already in `data`.
@@ -207,7 +207,7 @@ def _objections(
     for name in sorted(listed.keys() - known):
         if not name.startswith(f"{PAYLOAD}/"):
             yield name, "packed runs have no such file outside data/"
-    # No manifest can hold its own digest.
+    # No manifest can contain its own digest.
     for name in sorted(there.keys() - listed.keys() - {_MANIFESTS[1]}):
         yield name, "no manifest lists it"
     total, done = sum(there.values()), 0
@@ -219,7 +219,7 @@ def _objections(
 
 
 def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:
-    """Return the digests that a manifest lists, by file name."""
+    """Return the digests that a manifest lists, keyed by file name."""
     listed: dict[str, str] = {}
     for number, line in enumerate(_text_of(bag / manifest).splitlines(), 1):
         match = _LINE.fullmatch(line)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Claims of an archive: versions and hardware that differ from the reader's.
+"""Claims made by an archive: versions and hardware that differ from the reader's.
 
 The same code recorded both runs, so each states its own versions and hardware. Each
 difference between the two is a claim.
@@ -28,20 +28,20 @@ from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
 _COMPILING: Final = ("mujoco", "machine")
-# A version may not be a sentence.
+# A version must be short, and cannot be a sentence.
 VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
-# Other keys are not claims of versions: some excuses have other names.
+# Only these names claim versions; some excuses have other names.
 _PACKAGES: Final = frozenset(("python", *PACKAGES, "zlib"))
 _RECORDING: Final = "recording "
 _METADATA: Final = ".meta.json"
-# For each name, the value to compare and the one to show, which may be the same.
+# For each name, the value to compare and the value to show, which may be the same.
 _Stated: TypeAlias = Mapping[str, tuple[str, ...]]
 _NONE: Final = ("none",)
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 
 def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
-    """Return the excuses that follow from two runs' folders (their `data/`)."""
+    """Return the excuses that follow from comparing two runs' `data/` folders."""
     found = list(_all_claims(given, made))
     if not any(excuse.name in _COMPILING for excuse in found):
         return found
@@ -93,7 +93,7 @@ def _claims(given: _Stated, made: _Stated, items: Iterable[str]) -> Iterator[Exc
 
 
 def _stated(path: Path) -> _Stated:
-    """Return the versions and hardware that a recording's file states."""
+    """Return the versions and hardware that are stated in a recording's file."""
     if path.suffix == ".jsonl":
         with open_regular(path) as file:
             line = json_object(file.readline(_LONGEST_LINE))

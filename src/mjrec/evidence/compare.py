@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Item-by-item comparison of a packed run with the same run recreated.
+"""Item-by-item comparison of a packed run with its recreation.
 
-Files with equal bytes need no further check. Otherwise a comparator for each kind of
-file finds the differences, and an excuse may allow them. A file that only one run has
-is a difference. Memory use does not depend on the number of episodes; time is
+Files with equal bytes need no further check. For all others, a comparator for their
+kind finds the differences, and an excuse may allow them. A file that exists in only one
+run is a difference. Memory use does not depend on the number of episodes; time is
 proportional to it.
 """
 
@@ -82,7 +82,7 @@ class _Kind(NamedTuple):
 
 
 # Kinds of files, keyed by the ending of their names, in the order of the comparison.
-# Metadata comes after videos, because it has the hash of the decoded frames.
+# Metadata comes after videos, because it contains the hash of the decoded frames.
 _KINDS: Final[Mapping[str, _Kind]] = {
     ".zip": _Kind(Topic.IDENTITY, compare_sources),
     ".mjb.gz": _Kind(
@@ -127,8 +127,8 @@ class Comparison:
         on_progress: called with the number of bytes compared so far and in total.
 
     Attributes:
-        excuses: the excuses that were used or refuted, once the last finding has been
-            yielded.
+        excuses: the excuses that were used or refuted; complete once the last finding
+            has been yielded.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class Comparison:
         excuses = applicable(merged([*claims, *map(noted_excuse, self._notes)]))
         trial = Trial(with_allowed(excuses, self._allow))
         for note in self._notes:
-            # The others matter only for differences.
+            # Other notes matter only for differences.
             if is_fed(str(note.excuse)):
                 trial.believe(note)
         for found in self._compare():
@@ -187,7 +187,7 @@ class Comparison:
             yield from self._not_compared()
 
     def _names(self, folder: Path) -> dict[str, int]:
-        """Return the sizes of the files to compare, by name."""
+        """Return the sizes of the files to compare, keyed by name."""
         found = {
             path.relative_to(folder).as_posix(): path.lstat().st_size
             for path in (folder / RECORDINGS).rglob("*")
@@ -204,14 +204,14 @@ class Comparison:
         ending, model = _ending(file), model_name(file)
         renamed = self._rules.renamed
         if model in renamed or model in renamed.values():
-            # The sources are the same; the name has the hash of the compiled model.
+            # The sources are equal, but the name contains the compiled model's hash.
             if is_given and ending == ".mjb.gz":
                 yield replace(RECOMPILED, file=file)
             return
         if not is_given and self._level is not Level.PIXELS and ending == ".h5":
             with open_hdf5(self._made / file) as reader:
                 if reader.facts.get("kept") is False:
-                    # It would be removed once its video is rendered.
+                    # The recorder removes it once its video is rendered.
                     return
         if is_given and ending in _MODELS and self._is_unplayed(model):
             reason = "the recordings of this model could not be recreated"
@@ -220,7 +220,7 @@ class Comparison:
         yield Difference(
             _kind(file).topic,
             file=file,
-            # A missing compiled model is not excused as compiled elsewhere.
+            # A compiled model missing from the archive is not excused.
             aspect=Aspect.MODEL if ending == ".mjb.gz" and is_given else Aspect.EXACT,
             how=_NOT_MADE
             if is_given
@@ -267,7 +267,7 @@ class Comparison:
         yield Same(Topic.FILES)
 
     def _not_compared(self) -> Iterator[Same | Difference | Finding]:
-        """Yield what this level skips, and compare the sampled frames."""
+        """Yield the items that this level skips, and compare the sampled frames."""
         videos = sorted((self._given / RECORDINGS).glob("*.mp4"))
         frames = drawn = 0
         for path in videos:

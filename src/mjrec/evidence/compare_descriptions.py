@@ -50,7 +50,7 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
 
 
 def written_again(bag: Path) -> dict[str, str]:
-    """Return a bag's descriptions, regenerated from its recordings, by file name.
+    """Return a bag's descriptions, regenerated from its recordings, keyed by file name.
 
     Raises:
         Error: a file is damaged or has invalid contents.
@@ -86,7 +86,7 @@ def _compare(name: str, path: Path, text: str) -> Same | Difference:
             return _difference(name, only_in(True, one), where=f"line {number}")
         case None, (_, other):
             return _difference(name, only_in(False, other))
-    return _difference(name, "its spaces, or the order of its lines, differ")
+    return _difference(name, "its whitespace or the order of its lines differs")
 
 
 def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of JSON files, value by value: journal, statistics, manifest, metadata.
 
-A table lists each key that may differ from the recreated one, with its topic and how it
-may differ. Every other key must exist and be equal.
+A table lists the keys whose values may differ from the recreated ones, with a topic and
+the allowed kind of difference. All other keys must exist and have equal values.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ABSENT: Final = object()
 
 
 class Rule(NamedTuple):
-    """A key's topic, how it may differ, and for a CLAIM the name of the excuse."""
+    """A key's topic, how its value may differ, and the excuse's name for a CLAIM."""
 
     topic: Topic
     aspect: Aspect = Aspect.EXACT
@@ -48,18 +48,18 @@ _OF_FILES: Final = Rule(Topic.FILES)
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """How the values of a file are compared.
+    """The rules for comparing the values in a file.
 
     Attributes:
         given: the archive's file.
         usual: the topic of all keys that the table does not list.
         left_out: keys to ignore.
-        renamed: names in the archive, mapped to those of the recreated files: a
-            compiled model has its hash in its name.
+        renamed: names in the archive, mapped to the names of the recreated files (the
+            name of a compiled model contains its hash).
         is_packed: whether packing removed the lines about rows from journals.
         is_drawn: whether the recreated run was rendered.
-        decoded: the SHA-256 of all decoded frames of the archive's videos, by path.
-            The comparison of videos adds them.
+        decoded: the SHA-256 of all decoded frames of the archive's videos, keyed by
+            path. The comparison of videos adds them.
     """
 
     given: Path
@@ -71,7 +71,7 @@ class Rules:
     decoded: dict[Path, str] = field(default_factory=dict)
 
     def translated(self, text: bytes) -> bytes:
-        """Return bytes of the archive, with names replaced by the recreated files'."""
+        """Return bytes from the archive, with its names replaced by recreated ones."""
         for name, again in self.renamed.items():
             text = text.replace(name.encode(), again.encode())
         return text
@@ -88,7 +88,7 @@ _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
-# For all files: a key means the same thing everywhere, and so do the keys below it.
+# For all files, because a key and the keys below it mean the same thing everywhere.
 _KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _RETURN),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
@@ -109,11 +109,11 @@ _KEYS: Final[Mapping[str, Rule]] = {
     "machine": Rule(Topic.PHYSICS, Aspect.CLAIM, "machine"),
     "model": _MODEL,
 }
-# The keys of versions by package name.
+# The keys whose values contain versions, keyed by package name.
 _VERSIONS: Final = frozenset(("versions", "rendered_with"))
 # The program's name and version. Its other arguments are not claims.
 _ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
-# Which of several similar devices rendered. EGL numbers them; other APIs do not.
+# Which of several similar devices rendered. Only EGL numbers them.
 _DEVICE: Final = {
     "file": re.compile(r"/dev/[\w/-]{1,80}", re.ASCII),
     "uuid": re.compile(r"GPU-[0-9a-f-]{36}", re.ASCII),
@@ -126,7 +126,7 @@ def _is_own_sha256(rules: Rules, value: Any) -> bool:
 
 
 def _is_gl_device(_: Rules, value: Any) -> bool:
-    """Return whether a value is ABSENT or a valid `gl_device`, free of other text."""
+    """Return whether a value is ABSENT or a valid `gl_device` with no other text."""
     if value is ABSENT:
         return True
     if not isinstance(value, dict) or type(value.get("index")) is not int:
@@ -138,8 +138,8 @@ def _is_gl_device(_: Rules, value: Any) -> bool:
     )
 
 
-# Whether a value that differs from the recreated one is right for the archive's own
-# file, or cannot be recreated. Called with the value, or ABSENT.
+# Tests of whether a value that differs from the recreated one is correct for the
+# archive's own file, or cannot be recreated. Called with the value, or ABSENT.
 _OWN: Final[Mapping[str, Callable[[Rules, Any], bool]]] = {
     "file_sha256": _is_own_sha256,
     "decoded_sha256": lambda rules, value: (
@@ -213,7 +213,7 @@ def json_differences(
         made: the recreated value.
         rules: the rules of the comparison.
         where: the values' path in the file.
-        episode: the number of the episode that they belong to.
+        episode: the number of the episode that the values belong to.
     """
 
     def walk(
@@ -249,7 +249,7 @@ def json_differences(
 
 
 def _rule(key: str, where: str, outer: Rule | None) -> Rule | None:
-    """Return the rule for a key below one with the rule `outer`."""
+    """Return the rule for a key that is below one with the rule `outer`."""
     if where.endswith(_ENCODER):
         return _FFMPEG
     if outer is not None and not outer.claim.endswith("*"):
@@ -276,8 +276,8 @@ def _leaf(
         aspect is Aspect.CLAIM and rule.claim != "machine"
     )
     if (is_gone and not may_be_gone) or (aspect is Aspect.SUMMED and size is None):
-        # Another version never turns a non-number into a number, or omits a key. But a
-        # package, or OpenGL's names, may be missing on this machine.
+        # A different version never turns a non-number into a number, or omits a key.
+        # But a package, or OpenGL's names, may be missing on this machine.
         aspect = Aspect.EXACT
     return Difference(
         rule.topic,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of two models: their sources and the compiled models.
 
-Sources must be equal, except for the name of their main file. A compiled model has its
-hash in its name, and depends on the version of MuJoCo that compiled it.
+Sources must be equal, except for the name of their main file. A compiled model's name
+contains its hash, which depends on the version of MuJoCo that compiled it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .findings import Topic
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers; the last is the version. No real model reaches 1 GiB.
+# Four numbers, the last of which is the version. No real model reaches 1 GiB.
 _MODEL_HEAD: Final = 16
 _LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"
@@ -50,7 +50,7 @@ def model_name(file: str) -> str:
 
 
 def renamed_models(given: Path, made: Path) -> dict[str, str]:
-    """Return the recreated names of models with the same sources but a new name."""
+    """Map models to their recreated names if only the names differ, not the sources."""
     sources: list[dict[str, str]] = []
     for folder in (given, made):
         names: dict[str, str] = {}
@@ -99,7 +99,7 @@ def compare_models(given: Path, made: Path, _: object) -> Iterator[Same | Differ
         except (OSError, EOFError, zlib.error) as error:
             raise UnreadableFile(path, error) from error
     if contents[0][:_MODEL_HEAD] == contents[1][:_MODEL_HEAD]:
-        # The header has the version of MuJoCo that wrote the model.
+        # The header contains the version of MuJoCo that wrote the model.
         yield Same(Topic.IDENTITY, unit="compiled model")
     if contents[0] != contents[1]:
         yield RECOMPILED

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of two trajectories, dataset by dataset and attribute by attribute.
 
-Rows are read in blocks, so memory does not grow with an episode's length.
+Rows are read in blocks, so memory use does not grow with an episode's length.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _DATASETS: Final = {
 _MEMBERS: Final = {"warmstart": Aspect.SOLVER, "qvel": Aspect.VELOCITY}
 _UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
 _FACTS: Final = "facts"
-# Derived from the facts; reading a trajectory checks it.
+# Derived from the facts, and checked whenever a trajectory is read.
 _CHECKSUM: Final = "crc32"
 
 
@@ -179,7 +179,7 @@ def _compare_datasets(
 
 
 def _same(name: str, item: Any, worst: Mapping[_Key, Difference]) -> Iterator[Same]:
-    """Yield the items that the equal rows of a dataset prove."""
+    """Yield the items that are proved equal by the equal rows of a dataset."""
     if not isinstance(item, h5py.Dataset):
         return
     if name == "rewards" and not worst:
@@ -192,7 +192,7 @@ def _same(name: str, item: Any, worst: Mapping[_Key, Difference]) -> Iterator[Sa
 
 
 class _Rows:
-    """The rows of a dataset that differ.
+    """The differing rows of a dataset.
 
     The first state is counted separately: it is the episode's initial state.
 
@@ -202,8 +202,8 @@ class _Rows:
         aspect: the aspect of its numbers.
 
     Attributes:
-        counts: the number of rows that differ, by topic and aspect.
-        worst: the largest difference, by topic and aspect.
+        counts: the number of differing rows, keyed by topic and aspect.
+        worst: the largest difference, keyed by topic and aspect.
     """
 
     def __init__(self, name: str, topic: Topic, aspect: Aspect) -> None:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files to pack from monitor directories: those that their manifests vouch for.
+"""Selection of the files to pack from monitor directories.
 
 For each monitor, these are the manifest and the files that it names (statistics,
 finished and broken videos), the journal, the frame hashes, the trajectories and their
 models. Locks, unfinished files, unreadable logs, second names of videos, and videos
-that were rerendered differently are left out: no manifest names them.
+that were rerendered differently are left out, because no manifest names them.
 
-If episodes are chosen, the trajectories of all others are packed without states and
-snapshots. Actions, rewards and seeds of every episode stay, so all of them can be
-recreated.
+If episodes are chosen, the trajectories of all other episodes are packed without states
+and snapshots. Actions, rewards and seeds of every episode are kept, so all of them can
+be recreated.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
 
 
 def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
-    """Add a directory's monitors, whose infixes must differ from all earlier ones."""
+    """Add a directory's monitors, whose infixes must differ from earlier infixes."""
     for monitor in monitors_of(place):
         if monitor.manifest is None:
             continue

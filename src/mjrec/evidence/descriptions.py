@@ -2,8 +2,8 @@
 """Descriptions of a packed run: table, JSON, README, citation and crate.
 
 The crate is an RO-Crate 1.1 that conforms to the Process Run Crate 0.5 profile. Each
-monitor is a `CreateAction`: its instruments are the recording software, its objects the
-environment, the models and the policy, and its results the monitor's files.
+monitor is a `CreateAction`: its instruments are the recording software, its objects are
+the environment, the models and the policy, and its results are the monitor's files.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from .statements import Author
 
 # Maximum number of rows in the table of videos. The statistics list all videos.
 _MOST_VIDEOS = 200
-# Maximum number of monitors named for a value that only some of them have.
+# Maximum number of monitors to name for a value that only some monitors have.
 _MOST_MONITORS = 3
 _UNKNOWN = "not recorded"
 _FORMATS = {
@@ -80,14 +80,14 @@ _HOMES = {
 def descriptions(
     run: PackedRun, recordings: Path, *, packed_with: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the contents of all descriptions, by file name.
+    """Return the contents of all descriptions, keyed by file name.
 
-    They depend only on the recordings and the arguments.
+    The descriptions depend only on the recordings and the arguments.
 
     Args:
         run: the packed run to describe.
         recordings: the folder of the packed recordings.
-        packed_with: the versions of the software that packs it.
+        packed_with: the versions of the software that packs the run.
 
     Raises:
         UnreadableFile: a file is damaged.
@@ -109,7 +109,7 @@ def descriptions(
             f"{CRATE}.jinja", run, finalize=_json, files=files, recordings=recorded
         )
     )
-    # Each entity once, and without unknown values.
+    # Each entity appears once, and unknown values are left out.
     graph: dict[str, Any] = {}
     for entity in crate["@graph"]:
         known = {key: value for key, value in entity.items() if value is not None}
@@ -148,7 +148,7 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
     """Return the content of `environment.json`.
 
     Returns:
-        `recordings`: for each monitor, by its infix, `env_id`, `versions`, `provenance`
+        `recordings`: for each infix of a monitor, `env_id`, `versions`, `provenance`
         (null if not recorded), and `pictures` and `encoders`, the distinct renderers
         and encoders of its videos. `packed_with`: the versions of the software that
         packed the archive, and the packing options.
@@ -238,7 +238,7 @@ def _rendered(
     name: str, run: PackedRun, *, finalize: Callable[[Any], str], **facts: Any
 ) -> str:
     """Render a template for a run; `finalize` formats each value."""
-    # Part of the extra `evidence`, so it is not imported with this module.
+    # Jinja2 is part of the extra `evidence`, so it is not imported with this module.
     try:
         import jinja2
     except ImportError as error:

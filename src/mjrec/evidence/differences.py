@@ -22,14 +22,14 @@ _VIDEO_OR_TRAJECTORY: Final = re.compile(r"openaigym\.(video|trajectory)\.")
 
 
 class Aspect(enum.Enum):
-    """How an item differs, which decides what may excuse it.
+    """How an item differs, which determines the excuses that may apply.
 
     Attributes:
         EXACT: values that must be equal; no version or machine changes them.
         STATE: numbers of the simulation.
         VELOCITY: velocities of the simulation.
         DERIVED: numbers that the environment computes from states.
-        SUMMED: sums of such numbers: the returns.
+        SUMMED: sums of DERIVED numbers: the returns.
         OBSERVED: outputs of the environment or a wrapper other than rewards and episode
             ends: observations, success.
         SOLVER: the warm start, which only the solver uses.
@@ -39,8 +39,8 @@ class Aspect(enum.Enum):
         ENCODED: bytes from the encoder that prove nothing on their own.
         STORED: the contents are equal, but not the bytes that store them.
         CLAIM: a version, or the name of hardware.
-        STATEMENT: a value that cannot be recreated, or that follows from a file of the
-            archive itself and is right for that file. It is not reported.
+        STATEMENT: a value that cannot be recreated, or that follows from a file in the
+            archive itself and is correct for that file. It is not reported.
     """
 
     EXACT = "exact"
@@ -65,12 +65,12 @@ class Place:
 
     Attributes:
         topic: the item's topic.
-        file: the file's name below `data/`. Comparators leave it out.
+        file: the file's name below `data/`. Comparators do not set it.
         count: number of units.
         unit: the unit that is counted, such as "episode", "step", "frame", "video" or
             "file".
-        episode: the number of the item's episode. None if the file's name states it, or
-            if the item belongs to no episode.
+        episode: the number of the item's episode. None if the file's name contains it,
+            or if the item belongs to no episode.
     """
 
     topic: Topic
@@ -102,7 +102,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Same(Place):
-    """An item that is equal, bit for bit."""
+    """An item that is bit-identical in both runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +116,8 @@ class Difference(Place):
         size: the largest `abs(x - y) / (1 + abs(x))` for numbers. None if the
             difference has no size.
         claim: the name of the excuse for a CLAIM: "mujoco", "gl", "ffmpeg", "machine".
-        figures: further numbers, keyed by name, such as `psnr`, `ssim` and `block` for
-            PICTURE.
+        figures: additional numbers, keyed by name, such as `psnr`, `ssim` and `block`
+            for PICTURE.
     """
 
     aspect: Aspect = Aspect.EXACT
@@ -151,7 +151,7 @@ STORED_DIFFERENTLY: Final = Difference(
 
 
 def only_in(is_given: bool, value: Any) -> str:
-    """Return a clause that says which one of the two runs has a value."""
+    """Return a clause that says which of the two runs has a value."""
     who = "the archive" if is_given else "the recreated run"
     return f"only {who} has it: {short(value)}"
 

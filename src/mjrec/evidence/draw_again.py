@@ -43,7 +43,7 @@ def draw_sample(
 
     Args:
         directory: the directory of the recordings.
-        into: a new folder, which gets the frames as `<video>/<number>.png`.
+        into: a new folder for the frames, `<video>/<number>.png`.
         count: maximum number of frames per video.
         seed: the seed of the random choice of frames.
         on_progress: called with the number of frames rendered so far and in total.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recreation of the choice among the episodes of an evaluation.
+"""Recreation of an evaluation's choice of episodes.
 
 An evaluation chooses its videos from the episodes of all recordings of an environment.
 If the archive contains all of these, the rule is applied again. If some are missing, or
@@ -46,7 +46,7 @@ def choose_for_evaluations(
         recordings: the inputs of all recordings.
         directory: the directory of the recreated recordings. Their monitors must be
             closed.
-        notes: receives the choices that are believed.
+        notes: receives notes on the choices that are believed.
     """
     groups: dict[str, list[RecordingInputs]] = {}
     for each in recordings:
@@ -103,7 +103,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
 def _made_again(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
-    """Return the episodes that the rule chooses from the replayed ones."""
+    """Return the episodes that the rule chooses from all replayed episodes."""
     ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
         for facts in recording.failed:

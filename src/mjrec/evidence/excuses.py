@@ -35,12 +35,12 @@ _Allowed: TypeAlias = Mapping[Aspect, float | Limits]
 
 # Between MuJoCo 3.17 and 4.0, and with and without the CPU's FMA, a step of a model
 # whose bodies touch as spheres, capsules and planes differs by 2e-12. Contacts that are
-# found by iterating (boxes, meshes, height fields) jump: by 2e-7 without FMA, by 2.5e-3
-# between major versions. Velocities are differences divided by a time, and rewards
-# depend on them.
+# computed iteratively (boxes, meshes, height fields) jump: by 2e-7 without FMA, and by
+# 2.5e-3 between major versions. Velocities are differences divided by a time, and
+# rewards depend on them.
 _NEAR: Final[_Allowed] = {Aspect.STATE: 1e-6, Aspect.DERIVED: 1e-4}
 _OTHER_MAJOR: Final[_Allowed] = {Aspect.STATE: 1e-2, Aspect.DERIVED: 1e-2}
-# Sums in a different order.
+# For sums computed in a different order.
 _ROUNDED: Final[_Allowed] = {Aspect.STATE: 1e-9, Aspect.DERIVED: 1e-6}
 _REDRAWN: Final[_Allowed] = {Aspect.HASH: math.inf, Aspect.ENCODED: math.inf}
 _RESTORED: Final[_Allowed] = {Aspect.STORED: math.inf}
@@ -55,7 +55,7 @@ class _Rule:
     Attributes:
         kind: the kind of the excuse.
         costs: how the excuse weakens the comparison, as a clause.
-        allows: the largest allowed differences, by aspect.
+        allows: the largest allowed differences, keyed by aspect.
         fed: topics whose values were copied from the archive into the recreated run.
             Equality proves nothing there, and a difference is not excused.
     """
@@ -66,7 +66,7 @@ class _Rule:
     fed: Sequence[Topic] = ()
 
 
-# Every difference of its items is believed.
+# Every difference in its items is believed.
 _ENVIRONMENT: Final = "environment"
 _STEPS: Final = "steps and rewards are compared within a tolerance"
 _BY_NAME: Final[Mapping[str, _Rule]] = {
@@ -140,8 +140,8 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     "unseeded beginning": _Rule(
         ExcuseKind.EVENT, "its initial state is believed", fed=(Topic.BEGINNING,)
     ),
-    # An encoder's death may become visible only at the end, and the order of the keys
-    # depends on when it does.
+    # An encoder's death may not be noticed until the end, and the order of the keys
+    # depends on when it is noticed.
     "broken video": _Rule(
         ExcuseKind.EVENT,
         "the frame at which it was cut short is believed",
@@ -163,9 +163,9 @@ _ANY_VERSION: Final = _Rule(
 )
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
 _NOTED: Final = (Aspect.CLAIM, Aspect.STORED, Aspect.ENCODED)
-# How numbers that other code has computed can differ.
+# The ways in which numbers computed by other code can differ.
 COMPUTED: Final = (Aspect.STATE, Aspect.VELOCITY, Aspect.DERIVED, Aspect.SUMMED)
-# The aspect whose limit applies if an excuse has none for this one.
+# For each aspect, the aspect whose limit applies if an excuse sets none.
 _WIDER: Final = {
     Aspect.VELOCITY: Aspect.STATE,
     Aspect.SUMMED: Aspect.DERIVED,
@@ -178,7 +178,7 @@ _BELIEVED: Final = {
     Aspect.HASH: "they were rendered elsewhere",
 }
 _FAMILIES: Final = ("llvmpipe", "softpipe", "nvidia", "amd", "radeon", "intel", "apple")
-# In the folder of a recreated run.
+# The name of a file in the folder of a recreated run.
 _NOTES: Final = "maker.json"
 
 
@@ -189,7 +189,7 @@ def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
         name: the name of a rule, or of a package without its own rule.
         claimed: the archive's value.
         here: the reader's value.
-        items: the items that it is claimed for. The whole archive if empty.
+        items: the items that the excuse is claimed for; the whole archive if empty.
     """
     kind, costs = _rule(name).kind, _rule(name).costs
     return Excuse(
@@ -221,7 +221,7 @@ def write_notes(folder: Path, notes: Iterable[Finding]) -> None:
 
 
 def read_notes(folder: Path) -> list[Finding]:
-    """Return the notes in a folder; empty if it has none."""
+    """Return the notes in a folder, or an empty list if it has none."""
     path = folder / _NOTES
     said = json_text.loads(path.read_text()) if path.exists() else []
     return [from_json(Finding, each) for each in said]
@@ -230,7 +230,7 @@ def read_notes(folder: Path) -> list[Finding]:
 def noted_excuse(note: Finding) -> Excuse:
     """Return the excuse that a note claims."""
     name = str(note.excuse)
-    # For code, the reason names it.
+    # For code, the reason contains the name of the code.
     is_stated = _rule(name).kind is not ExcuseKind.EVENT
     return excuse_of(name, note.reason if is_stated else "", "", note.item)
 
@@ -257,7 +257,7 @@ def _merged(same: list[Excuse]) -> Excuse:
 
 
 def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Drop excuses that need two major versions of MuJoCo where there is only one."""
+    """Drop excuses that need two major MuJoCo versions if only one was used."""
     known = tuple(excuses)
     others = {
         item

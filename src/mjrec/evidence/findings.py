@@ -54,7 +54,7 @@ class Outcome(enum.StrEnum):
 
 
 class ExcuseKind(enum.StrEnum):
-    """The only reasons for which an item may differ from the recreated one."""
+    """The only reasons why an item may differ from the recreated one."""
 
     VERSION = "version"
     HARDWARE = "hardware"
@@ -86,10 +86,10 @@ class Finding:
         outcome: the result of the comparison.
         reason: a clause. DIFFERENT: the place, the archive's value and the recreated
             value. BELIEVED: why the item was not recreated.
-        excuse: name of the excuse that allows it. None if none was needed or applies.
+        excuse: name of the excuse that allows the difference; None if there is none.
         count: number of units that the finding covers.
         unit: the unit of `count`: "episode", "step", "frame", "video", "file".
-        figures: numbers by name, for JSON: `maximum`, `tolerance`, `psnr` ...
+        figures: numbers for JSON, keyed by name: `maximum`, `tolerance`, `psnr` ...
         is_headline: whether it is shown next to the verdict (gaps, identical
             episodes).
     """

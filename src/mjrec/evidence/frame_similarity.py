@@ -2,7 +2,7 @@
 """Similarity of two frames, measured on the planes that an encoder works with.
 
 Frames are compared as the planes that a video holds: luma, and chroma at half the
-height and width. Converted back to RGB, a frame that has lost nothing but chroma
+height and width. If they were converted back to RGB, a frame that has lost only chroma
 resolution would seem to differ as much as a forged one.
 """
 
@@ -19,7 +19,7 @@ from ..frames import Frame, pad_to_even
 
 # The PSNR of two equal frames is infinite, which JSON cannot represent.
 _BEST_PSNR: Final = 100.0
-# Side of a block in pixels, and the number of samples of all planes in a block.
+# Side of a block in pixels, and the number of samples in a block over all planes.
 BLOCK: Final = 8
 SAMPLES_OF_BLOCK: Final = BLOCK**2 * 3 // 2
 # A 2x2 cell counts as shadowed in one frame only if its lumas differ by at least
@@ -60,7 +60,7 @@ class Similarity(NamedTuple):
             100 if the frames are equal.
         ssim: structural similarity of luma, the mean over blocks of 8x8 pixels.
         block: the largest root mean square difference of any block of 8x8 pixels, in
-            levels (0 to 255). A change of a few pixels hardly affects the other two.
+            levels (0 to 255). Changing a few pixels hardly affects PSNR and SSIM.
     """
 
     psnr: float
@@ -77,7 +77,7 @@ class Limits:
         ssim: the minimum SSIM.
         block: the maximum block difference, in levels.
         shadow: the maximum share of the frame that may be in shadow in only one of the
-            two, from 0 to 1.
+            two frames, from 0 to 1.
     """
 
     psnr: float
@@ -86,7 +86,7 @@ class Limits:
     shadow: float = 0.0
 
     def strain(self, found: Similarity) -> float:
-        """Return the difference as a fraction of what is allowed; above 1 fails."""
+        """Return the difference as a fraction of the limits; more than 1 fails."""
         noise = 10 ** ((self.psnr - found.psnr) / 20)
         return max(noise, (1 - found.ssim) / (1 - self.ssim), found.block / self.block)
 
@@ -100,7 +100,7 @@ OTHER_ENCODER: Final = Limits(psnr=32.0, ssim=0.97, block=20.0)
 # CPUs with AVX. Without AVX (128 bits instead of 256), five of six videos had no equal
 # frame: Gymnasium's HalfCheetah, Humanoid, Ant, Hopper, Pusher and Swimmer, from 64x64
 # to 480x480, had 41.7 dB, 0.998 and 9.4 levels at worst, apart from shadows in 0.14
-# per cent of a frame.
+# percent of a frame.
 OTHER_CPU: Final = Limits(psnr=38.0, ssim=0.985, block=14.0, shadow=0.01)
 # A different build of llvmpipe: its name includes the vector width in bits and the
 # version of LLVM.
@@ -114,19 +114,19 @@ OTHER_BUILD: Final = Limits(psnr=32.0, ssim=0.97, block=20.0, shadow=0.01)
 #
 # Whether a large floor casts shadows on itself in MuJoCo depends on rounding: at
 # 480x480, llvmpipe drew patches of them far away in one of five frames of HalfCheetah
-# (2.1 per cent of the frame), the H100 none. Without them the same frames had 42.9 dB.
+# (2.1 percent of the frame), the H100 none. Without them the same frames had 42.9 dB.
 OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0, shadow=0.04)
 
 
 def planes_of(frame: Frame) -> Planes:
     """Return the planes of a rendered frame, padded to an even width and height.
 
-    They match the planes passed to the encoder to within one level.
+    The result matches the planes passed to the encoder to within one level.
     """
     rgb = pad_to_even(frame).astype(np.float32) / 255
     luma = rgb @ _LUMA
     height, width = luma.shape
-    # The chroma of a 2x2 cell is the mean of its pixels' colours.
+    # The chroma of a 2x2 cell is the mean of its pixels' colors.
     quarter = rgb.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
     quarter_luma = quarter @ _LUMA
     blue = (quarter[..., 2] - quarter_luma) / (2 * (1 - _BLUE))
@@ -151,7 +151,7 @@ def similarity(one: Planes, other: Planes) -> Similarity:
 def but_for_shadows(one: Planes, other: Planes) -> tuple[Planes, float]:
     """Return `other` with samples of `one` wherever the two differ only in brightness.
 
-    There, one frame has the colour of the other times a factor from 0 to 1. Shadows
+    In such places, one frame's color is the other's times a factor from 0 to 1. Shadows
     have this effect, but so does painting pixels black.
 
     Returns:

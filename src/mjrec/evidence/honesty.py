@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Remarks on a run that may be misleading even if it can be recreated.
 
-Its author may have chosen the seeds, shown one episode as two, or left some out. A
-video may show only part of its episode, or be faster than real time.
+Its author may have chosen the seeds, shown one episode as two, or left some episodes
+out. A video may show only part of its episode, or be faster than real time.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _REGISTERED = re.compile(r"dm_control/.+|.+-v\d+")
 
 
 def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Yield what a reader should know regardless of the comparison's result.
+    """Yield remarks that concern a reader regardless of the comparison's result.
 
     Args:
         inputs: the run's inputs.
-        arrays: the arrays that the inputs name.
+        arrays: the arrays that the inputs refer to.
     """
     yield from _unfinished(inputs)
     for recording in inputs.recordings:
@@ -71,7 +71,7 @@ def _unfinished(inputs: Inputs) -> Iterator[Finding]:
 
 
 def _name(recording: RecordingInputs) -> Iterator[Finding]:
-    """Yield a remark if an environment goes by a name that is not its own."""
+    """Yield a remark if a recording's name is not that of its environment."""
     environment = recording.environment or {}
     env_id, name = environment.get("id"), recording.env_id
     is_registered = _REGISTERED.fullmatch(name) is not None
@@ -137,12 +137,12 @@ def _cuts(
 
 
 def _types(recording: RecordingInputs) -> Iterator[Finding]:
-    """Yield the training episodes of a recording that mixes them with evaluation."""
+    """Yield the training episodes of a recording that also contains evaluation."""
     complete = [each for each in recording.episodes if each.cut is None]
     training = [each.episode_id for each in complete if each.type != "e"]
     if training and len(training) < len(complete):
         reason = (
-            f"{len(training)} of {len(complete)} episodes are labelled training, the "
+            f"{len(training)} of {len(complete)} episodes are labeled training, the "
             f"others evaluation: {listed(sorted(training), _MOST_SHOWN)}"
         )
         yield _headline(recording.name, reason, Outcome.NOTED, len(training))
@@ -250,7 +250,7 @@ def _headline(
 
 
 def _missing(known: set[int], start: int, stop: int) -> tuple[int, str]:
-    """Return the number of unknown numbers in a range, and the first few as a list."""
+    """Return how many numbers in a range are unknown, and a list of the first few."""
     count = max(0, stop - start) - sum(start <= number < stop for number in known)
     missing = (number for number in range(start, stop) if number not in known)
     first = [*itertools.islice(missing, min(count, _MOST_SHOWN))]

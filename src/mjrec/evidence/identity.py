@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of people and machines: of the user who packs and of those who recorded."""
+"""Names of people and machines: those who recorded, and the user who packs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _VARIABLES = {
 _GIT_SETTINGS = r"^(user\.(name|email)|remote\..*\.(url|pushurl))$"
 _GIT_SECONDS = 10.0
 
-# Shorter remotes (`../x`) could occur anywhere.
+# Shorter remotes (`../x`) could match anywhere.
 _SHORTEST_REMOTE = 6
 # Home directories on Linux, on clusters and on macOS.
 HOME_OF_ANYBODY = r"/(?:[\w.-]+/)*?(?:home|Users)/[^/\s\"':,;<>]+"
@@ -62,7 +62,7 @@ class Identity:
         homes: absolute paths of home directories.
         directories: absolute paths of the user's work: working directories, roots of
             repositories, directories of policies and programs.
-        remotes: URLs of git repositories, and their `owner/name`.
+        remotes: URLs of git repositories, and the `owner/name` in them.
     """
 
     users: set[str] = field(default_factory=set)
@@ -85,7 +85,7 @@ class Identity:
             case "homes" | "directories":
                 path = os.path.normpath(text)
                 if path.startswith("/") and path not in _EVERYBODYS:
-                    # Messages may contain the path or the target of its link.
+                    # Messages may contain the path itself or the target of a link.
                     getattr(self, kind).update((path, os.path.realpath(path)))
             case "people" if " " not in text:
                 self.users.add(text)
@@ -113,7 +113,7 @@ class Identity:
 def identity_of_user(
     provenance: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
 ) -> Identity:
-    """Return the names of this user and machine, and of the people who recorded.
+    """Return the names of this user, of this machine, and of the people who recorded.
 
     They come from the system, the environment variables, and git's settings in the
     working directory and in the recorded repositories. No name server is queried.
@@ -196,7 +196,7 @@ def _add_provenance(identity: Identity, said: Mapping[str, Any]) -> None:
 def _host_names() -> Iterator[str]:
     name = os.uname().nodename
     yield name
-    # The machine's full name, if /etc/hosts has it.
+    # The machine's full name, if /etc/hosts contains it.
     try:
         lines = Path("/etc/hosts").read_text(errors="replace").splitlines()
     except OSError:

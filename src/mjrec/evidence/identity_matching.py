@@ -12,9 +12,9 @@ Matching ignores case. The rules are:
 - Login names and host names of at least six letters: anywhere, even inside other
   words. Those of four or five letters: with no letters next to them, or as a word in
   `CamelCase`.
-- Shorter ones, and those that are ordinary words here (`root`, `user`, `hopper`): only
+- Shorter names, and those that are ordinary words here (`root`, `user`, `hopper`): only
   as a whole part of a path, before `@` and a host name, or after `@`. HalfCheetah has
-  joints called `rootx`, which do not name an account.
+  joints called `rootx`, which is not the name of an account.
 
 In files, archives are opened, compressed files are decompressed, and every name,
 attribute and string in HDF5 files is checked.
@@ -118,7 +118,7 @@ class IdentityMatcher:
     def replaced_in_name(self, name: str) -> str:
         """Return a file name, or a part of one, with portable words as placeholders.
 
-        Short login names also match, between dots, hyphens and underscores.
+        Short login names also match between dots, hyphens and underscores.
         """
         return self._names.sub(_placeholder, name)
 
@@ -133,7 +133,7 @@ class IdentityMatcher:
     def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
         r"""Return the parts of the identity in UTF-8 or UTF-16 bytes, once each.
 
-        The bytes may be text or contain some. In binary data, matches of fewer than six
+        The bytes may be text or contain text. In binary data, matches of fewer than six
         letters count only in a run of at least twelve characters, because they occur
         by chance in numbers and in compressed data. JSON escapes such as `\u00e9` are
         decoded.
@@ -160,7 +160,7 @@ class IdentityMatcher:
     def _found_in_runs(
         self, runs: re.Pattern[bytes], content: bytes, encoding: str
     ) -> Iterator[str]:
-        # One search in the joined runs, because there are many.
+        # Search the joined runs in one go, because there are many.
         text = "\n".join(run.decode(encoding) for run in runs.findall(content))
         for match in self._texts.finditer(text):
             start = text.rfind("\n", 0, match.start()) + 1
@@ -293,7 +293,7 @@ def _places_in_file(path: Path, where: str) -> Iterator[_Place]:
         if not _FILM.match(piece):
             yield from _places(where, piece + file.read(), 0)
             return
-        # Videos are large and contain nothing packed that could name a person.
+        # Videos are large, and contain no compressed data that could name a person.
         while piece:
             following = file.read(_PIECE)
             yield where, piece + following[:_LONGEST_NAME], True
@@ -304,7 +304,7 @@ def _places(where: str, content: bytes, depth: int) -> Iterator[_Place]:
     if depth > _DEEPEST:
         raise ValueError(f"it contains archives more than {_DEEPEST} levels deep")
     is_packed = content.startswith((SIGNATURE, _ZIP, _GZIP))
-    # Packed data too: a header may contain a file's name.
+    # Compressed data is included, because its header may contain a file's name.
     yield where, content, is_packed
     if content.startswith(SIGNATURE):
         yield from _places_in_hdf5(where, content)

@@ -69,7 +69,7 @@ Dtype: TypeAlias = Annotated[str, _dtype]
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInputs:
-    """The inputs of one episode: its reset, its actions, and what cut it off.
+    """The inputs of one episode: its reset, its actions, and any cut-off.
 
     Attributes:
         episode_id: the episode's number.
@@ -86,7 +86,7 @@ class EpisodeInputs:
             MuJoCo version or machine: each step then starts from the recorded state
             before it, so that differences in the last bits do not grow. `<name>.<part>`
             are the parts of `RecordedSteps` if the environment has wrappers.
-        has_actions: whether the actions were kept, in the array or as irregular ones.
+        has_actions: whether the actions were kept, in the array or as irregular values.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of the arrays in a dictionary action; None if
             actions are plain arrays.
@@ -103,7 +103,7 @@ class EpisodeInputs:
         end_time: the stated end time.
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
             episode. They are used only if actions were not kept.
-        evaluation: `seed` and `episode` of the evaluation that it belongs to, or None.
+        evaluation: its `seed` and `episode` in an evaluation; None outside evaluations.
         selection: its video's facts about the choice among an evaluation's episodes.
     """
 
@@ -150,7 +150,7 @@ class RecordingInputs:
         episodes: the episodes, in order.
         evaluation_events: the journal's events ("begun" or "failed") about episodes of
             an evaluation, each as its kind and facts, in the journal's order.
-        evaluation_keeps: the facts of each choice among all recordings of an
+        evaluation_keeps: the facts about each choice among all recordings of an
             evaluation.
         faults: for each fault of the recorder, the number of journal lines before it
             (not counting the first) and its facts.
@@ -160,7 +160,7 @@ class RecordingInputs:
         provenance_after: number of lines in the journal before the provenance, not
             counting the first.
         was_killed: whether another process recovered the recording.
-        has_sources: whether its models' sources had been stored when it was killed.
+        has_sources: whether the models' sources had been stored when it was killed.
     """
 
     infix: str
@@ -190,7 +190,7 @@ class RecordingInputs:
 
     @property
     def failed(self) -> Sequence[Mapping[str, Any]]:
-        """The facts about each of an evaluation's episodes that failed."""
+        """The facts about each failed episode of an evaluation."""
         events = self.evaluation_events
         return [facts for kind, facts in events if kind == "failed" and facts]
 
@@ -233,7 +233,7 @@ class Inputs:
 
         Args:
             folder: an empty folder.
-            arrays: the arrays that the episodes name.
+            arrays: the arrays that the episodes refer to.
         """
         text = json_text.dumps(to_json(self))
         (folder / INPUTS_FILE).write_text(text)

@@ -4,7 +4,7 @@
 ::
 
     run.zip
-    └── run/                            one folder, of the zip's name
+    └── run/                            one folder, named like the zip file
         ├── bagit.txt                   BagIt 1.0 (RFC 8493)
         ├── bag-info.txt
         ├── manifest-sha512.txt
@@ -18,7 +18,7 @@
             └── recordings/             the monitor directory
                 └── openaigym.*
 
-`pack` writes it and `verify` reads it.
+`pack` writes this layout, and `verify` reads it.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ class _Playing:
 
     Args:
         recording: the recording's inputs.
-        recreated: its environment.
+        recreated: the recording's environment, recreated.
         making: the facts shared with the run's other recordings.
     """
 
@@ -148,7 +148,7 @@ class _Playing:
         try:
             self._play_all()
         except NotRecreated:
-            # Its files are of no use.
+            # The recording's files are not needed any more.
             with contextlib.suppress(Error):
                 self._monitor.close()
             raise
@@ -386,13 +386,13 @@ class _Playing:
 
 
 def _exception_kind(name: str) -> type[BaseException]:
-    """Return a new exception class that is recorded under this name; import nothing."""
+    """Return a new exception class with this recorded name, without importing any."""
     module, _, qualified = name.rpartition(".")
     return type(qualified, (Exception,), {"__module__": module or "builtins"})
 
 
 def _unpack_sources(path: Path, into: Path) -> tuple[Path, Any]:
-    """Unpack an MJCF file and the files that it refers to; return it and its model.
+    """Unpack an MJCF file and the files that it refers to; return its path and model.
 
     Args:
         path: the zip file that a recorder wrote.

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading an archive's mp4 file: its boxes, its stream, and its decoded frames.
 
-Players follow the boxes, whatever the frames are: a second track on top, an edit list
-that skips the end, non-square pixels. So the boxes are compared as well as the frames.
+Players obey the boxes, which may declare a second track on top, an edit list that skips
+the end, or non-square pixels. So both boxes and frames are compared.
 
 ffmpeg reads the file only as an mp4 with H.264, whatever the file declares, and opens
-no other file for it. The decoded stream states its own size, so that a video of a
-different size is not mistaken for one of the recorded size.
+no other files. The decoded stream states its own size, so that a video of a different
+size is not mistaken for one of the recorded size.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, regular_path
 from .frame_similarity import Planes
 
-# Boxes that contain boxes, and the number of bytes of their own that come first.
+# Boxes that contain boxes, and the number of their own bytes that precede these.
 _CONTAINERS: Final = {
     **dict.fromkeys(("moov", "trak", "edts", "mdia", "minf", "dinf", "stbl"), 0),
     "stsd": 8,
@@ -46,7 +46,7 @@ _LARGEST_BOX: Final = 1 << 27
 _MOST_BOXES: Final = 1000
 _BEGINNING: Final = ("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror")
 _INPUT: Final = ("-threads", "2", "-protocol_whitelist", "file", "-f", "mp4")
-# The colour tags that mjrec writes. The second filter keeps everything but frames;
+# The color tags that mjrec writes. The second filter keeps everything but frames;
 # decoding parameters are in the file's header, not among the frames.
 _TAGS: Final = (
     "h264_metadata=video_full_range_flag=0:colour_primaries=1:"
@@ -68,7 +68,7 @@ class Box:
     """A box in a file.
 
     Attributes:
-        path: its name after those of the boxes around it: "moov/trak/mdia".
+        path: its name, preceded by those of the enclosing boxes: "moov/trak/mdia".
         content: its own bytes; empty for `mdat`.
         size: size of its content in bytes, including boxes inside it.
     """
@@ -84,7 +84,7 @@ class Box:
 
 
 def read_boxes(path: Path) -> list[Box]:
-    """Return the boxes of an mp4 file in order; each comes before those inside it.
+    """Return the boxes of an mp4 file in order, each before the boxes inside it.
 
     Raises:
         UnreadableFile: the file is damaged or has far too many boxes.
@@ -176,12 +176,12 @@ def _table(boxes: Sequence[Box], name: str) -> NDArray[np.int64]:
 
 
 def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield the unusual contents of a video's stream: colour tags and captions.
+    """Yield the unusual contents of a video's stream: color tags and captions.
 
     x264's own message does not count.
 
     Yields:
-        The place, what it has, and what it should have.
+        The place, its content, and the expected content.
 
     Raises:
         EncoderError: the video cannot be read.
@@ -191,7 +191,7 @@ def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
         for filters in ("h264_mp4toannexb", f"h264_mp4toannexb,{_TAGS}")
     )
     if tagged != usual:
-        yield "colour tags", "other tags", "BT.709"
+        yield "color tags", "other tags", "BT.709"
     beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
     if beside and not _is_by_x264(beside):
         yield "the stream", "frames and messages", "frames"
@@ -238,7 +238,7 @@ def decoded_video(path: Path) -> Iterator[tuple[str, Iterator[Planes]]]:
     Raises:
         UnreadableFile: the path is not a regular file, or the video has no frames or an
             odd height or width.
-        EncoderError: the video cannot be decoded (to its end).
+        EncoderError: the video cannot be decoded completely.
         Error: ffmpeg cannot be started.
     """
     with unreadable(path):

@@ -2,8 +2,8 @@
 """Packing a monitor directory into one zip file that can be verified.
 
 The archive is built in a hidden folder next to its final path. Files are hard-linked
-into the folder if possible, so that a run of many gigabytes needs little space. Nothing
-in it is written in place: a changed file is written under a temporary name and renamed.
+into the folder if possible, so that a run of many gigabytes needs little space. They
+are never changed in place: a new version is written to a temporary file and renamed.
 """
 
 from __future__ import annotations
@@ -72,18 +72,18 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory, or a folder of several, such as an
+        directory: the monitor directory, or a folder with several, such as an
             evaluation's. Its monitors must be closed and its videos rendered.
         path: the archive, a new file that ends in `.zip`.
         title: the run's title. None generates one from the recorded environments.
-        authors: each "Name", "Name <address>" or "Name <ORCID>".
-        license: SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
+        authors: each in the form "Name", "Name <address>" or "Name <ORCID>".
+        license: SPDX identifier of the license, such as "CC-BY-4.0", or its URL.
         episodes: numbers of the episodes whose videos and states are packed. None means
-            all, and must be used for a folder of several directories. The statistics,
-            actions and seeds of all episodes are packed in any case, and the archive
-            records the choice.
-        anonymous: remove everything that names a user, a machine or an author, for
-            blind review.
+            all, and must be used for a folder with several directories. The statistics,
+            actions and seeds of all episodes are always packed, and the archive records
+            the choice.
+        anonymous: remove everything that identifies a user, a machine or an author,
+            for blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
             million). If the archive is larger, its videos are rerendered from the
             states at 3/4, 1/2, 3/8 or 1/4 of their width and height, and the archive
@@ -150,9 +150,9 @@ def pack(
 
 
 def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
-    """Pack a monitor directory into a new folder, with the content of an archive.
+    """Pack a monitor directory into a new folder, with the same content as an archive.
 
-    If the archive is anonymous, no names are searched for, because the recordings
+    If the archive is anonymous, names are not searched for, because the recordings
     contain none.
 
     Raises:
@@ -191,7 +191,7 @@ def _bag(
 def _make_bag(
     staged: Path, bag: Path, options: PackingOptions, identity: Identity | None
 ) -> PackedRun:
-    """Make a bag from the staged files; an earlier one is replaced."""
+    """Make a bag from the staged files, replacing any earlier bag."""
     shutil.rmtree(bag, ignore_errors=True)
     recordings = bag / PAYLOAD / RECORDINGS
     recordings.mkdir(parents=True)
@@ -262,7 +262,7 @@ def _folder_beside(archive: Path) -> Iterator[Path]:
 
 
 def _publish(finished: Path, path: Path) -> None:
-    """Give a finished archive its name without replacing a file."""
+    """Give a finished archive its final name without replacing an existing file."""
     try:
         path.hardlink_to(finished)
     except FileExistsError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The facts about a packed run that its descriptions are written from."""
+"""The facts from which the descriptions of a packed run are written."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ class Tally:
 
     Attributes:
         episodes: number of episodes.
-        steps: number of their steps.
+        steps: total number of steps.
         total_return: sum of their returns.
-        start: the time when the first one began, in ISO 8601 in UTC; None if unknown.
-        end: the time when the last one ended, in ISO 8601 in UTC; None if unknown.
+        start: start time of the first episode, in ISO 8601 and UTC; None if unknown.
+        end: end time of the last episode, in ISO 8601 and UTC; None if unknown.
     """
 
     episodes: int = 0
@@ -95,7 +95,7 @@ class Session:
     Attributes:
         infix: the infix of its files' names.
         env_id: the recorded environment's id.
-        versions: versions of Python and the recording packages, by name.
+        versions: versions of Python and the recording packages, keyed by name.
         provenance: the recording's provenance; empty if unknown.
         rule: the name of the rule that chose the recorded episodes.
         was_killed: whether its process was killed and the recording recovered.
@@ -163,7 +163,7 @@ class PackedRun:
 
     @property
     def title(self) -> str:
-        """The stated title, or one made of the recorded environments' ids."""
+        """The stated title, or one derived from the recorded environments' ids."""
         made = f"Recordings of {listed(self.env_ids, _SHOWN)}"
         return self.statements.title or made
 
@@ -205,7 +205,7 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
 
     Raises:
         UnreadableFile: a file is damaged.
-        InvalidArgument: a title, an author or a licence is invalid.
+        InvalidArgument: a title, an author or a license is invalid.
     """
     statements = state(
         title=options.title, authors=options.authors, license=options.license

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of files in an archive that mean the same thing wherever it is unpacked.
+"""File names that mean the same thing wherever their archive is unpacked.
 
 On every system, such a name refers to a file below the folder that the archive is
 unpacked into, and two different names refer to two different files.
@@ -35,7 +35,7 @@ def portable_parts(name: str) -> tuple[str, ...]:
 
 
 def check_distinct(names: Iterable[str]) -> None:
-    """Check that no two names are one file, or one file and folder, on any system.
+    """Check that no two names clash on any system, as files or as file and folder.
 
     Some systems do not distinguish upper case from lower case, or composed from
     decomposed accents.

@@ -45,8 +45,8 @@ _MOST_EPISODES = 1_000_000
 # The keys of the journal's events about episodes of an evaluation.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
-# The keys of a provenance that a recorder writes, and those below them if they are
-# always the same.
+# The keys of a provenance that recorders write, each with the fixed set of keys below
+# it, if any.
 _PROVENANCE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("command", "working_directory", "python", "packages"), ()),
     **dict.fromkeys(("system", "variables"), ()),
@@ -66,12 +66,12 @@ _FACTS = (
 )
 # The facts of a completed episode that are inputs, whether it has a trajectory or not.
 _OF_ENTRY = ("type", "seed", "options", "start_time", "end_time")
-# Those that are believed if its actions were not kept.
+# The facts that are believed if the episode's actions were not kept.
 _ENDS = ("reward", "terminated", "truncated", "success")
 
 
 def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
-    """Return the inputs of a run and the arrays that they name.
+    """Return the inputs of a run and the arrays that they refer to.
 
     Args:
         data: the folder that contains the recordings and, for a packed run, its
@@ -328,7 +328,7 @@ def _of_trajectory(
         **_known(facts, _FACTS),
         "steps": steps,
         "arrays": name,
-        # If no action fits into an array, all of them are in the journal.
+        # If no action fits into an array, all actions are in the journal.
         "has_actions": name in arrays or len(irregular) == steps,
         "irregular": irregular,
         "selection": _selection(facts.get("video")),
@@ -378,7 +378,7 @@ def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return the values of known keys; the others cannot be recreated."""
+    """Return the values of known keys; other values cannot be recreated."""
     return {key: value for key, value in said.items() if key in keys}
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Size limits for archives: videos are rerendered smaller until the archive fits.
 
-All their frames are rendered from the recorded states, and the new videos get their own
+All frames are rendered from the recorded states, and the new videos get their own
 metadata and hashes. An encoded video is never re-encoded: videos that were rendered
 live or have no recorded states stay unchanged.
 """
@@ -91,12 +91,12 @@ def shrinking(
     *,
     on_progress: Callable[[Progress], object],
 ) -> Iterator[None]:
-    """Yield each time an archive must be made; its videos shrink until it fits.
+    """Yield whenever an archive must be made, and shrink videos until it fits.
 
     Args:
         limit: maximum size of the archive in bytes.
         staged: the folder with the recordings to pack.
-        archive: the archive to make of them.
+        archive: the archive to make from them.
         on_progress: called with the progress of rerendering.
 
     Raises:
@@ -194,7 +194,7 @@ def _draw_all(
 
 
 def _amend(video: Path, said: dict[str, Any]) -> None:
-    """Complete a smaller video's metadata from that of the recorded one."""
+    """Complete a smaller video's metadata with values from the recorded video's."""
     with unreadable(metadata_path(video)):
         drawn = read_object(metadata_path(video))
     for key in ("frame_count", "frame_steps", "fps"):

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The three processes of a verification, run one after another, each in a sandbox.
 
-- `open` sees the given archive: it unpacks it, checks the bag, and reads the inputs.
-- `make` sees only the inputs, and recreates the run.
-- `compare` sees the two runs.
+- `open` gets the given archive, unpacks it, checks the bag, and reads the inputs.
+- `make` gets only the inputs, and recreates the run.
+- `compare` gets the two runs.
 
 Each sends messages to `verify`, which started it: `count` (progress), `phase`,
 `inputs`, `finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the
-reason. `refused` means that the given path cannot be verified, `error` that this
-machine does not have enough space.
+reason. `refused` means that the given path cannot be verified, and `error` means that
+this machine does not have enough space.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from .inputs import ARRAYS_FILE, Inputs
 from .layout import PAYLOAD, RECORDINGS, SAMPLED
 
 MODULE: Final = "mjrec.evidence.stages"
-# Below the folder of a verification. Each is in the folder of the stage that creates
-# it, which may write only there.
+# Paths below the folder of a verification. Each is in the folder of the stage that
+# creates it, because a stage may write only to its own folder.
 GIVEN: Final = "open/given"
 INPUTS: Final = "open/inputs"
 MADE: Final = "make/made"
@@ -76,7 +76,7 @@ def main() -> int:
     return 0
 
 
-# Each stage imports its own part: `make` needs MuJoCo and environments, `open` h5py.
+# Each stage imports only what it needs: `make` MuJoCo and environments, `open` h5py.
 
 
 def _open(request: Mapping[str, Any], say: _Say) -> None:
@@ -156,7 +156,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
             try:
                 play_recording(recording, making)
             except NotRecreated as error:
-                # A part of a recording proves nothing.
+                # Part of a recording proves nothing.
                 for path in iter_monitor_files(played, hidden=True):
                     if infix_of(path.name) == recording.infix:
                         path.unlink()

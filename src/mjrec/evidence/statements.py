@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An author's statements about a packed run: its title, authors and licence."""
+"""An author's statements about a packed run: its title, authors and license."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Author:
 
 @dataclass(frozen=True, kw_only=True)
 class License:
-    """A licence.
+    """A license.
 
     Attributes:
         name: its SPDX identifier, or its URL.
@@ -61,7 +61,7 @@ class Statements:
     Attributes:
         title: the run's title; None to generate one from the recorded environments.
         authors: the authors, in order.
-        license: the licence, or None if none was stated.
+        license: the license, or None if none was stated.
     """
 
     title: str | None = None
@@ -75,8 +75,8 @@ def state(
     """Check and parse the statements about a run.
 
     Raises:
-        InvalidArgument: the title, an author or the licence is invalid.
-        MissingDependency: a licence is given as an SPDX identifier, but a recent
+        InvalidArgument: the title, an author or the license is invalid.
+        MissingDependency: a license is given as an SPDX identifier, but a recent
             `packaging` is not installed.
     """
     if isinstance(authors, str):
@@ -123,10 +123,10 @@ def _license(text: object) -> License:
     if _URL.fullmatch(line):
         return License(name=line, url=line)
     spdx = _spdx_identifier(line)
-    # Expressions with several licences and LicenseRefs, which are private, are invalid.
+    # Expressions with several licenses and LicenseRefs, which are private, are invalid.
     if not spdx or " " in spdx or spdx.startswith("LicenseRef-"):
         raise InvalidArgument(
-            "license must be the identifier of one licence in the SPDX list "
+            "license must be the identifier of one license in the SPDX list "
             '(https://spdx.org/licenses), such as "CC-BY-4.0", or the URL of its text, '
             f"got {text!r}."
         )
@@ -134,14 +134,14 @@ def _license(text: object) -> License:
 
 
 def _spdx_identifier(text: str) -> str:
-    """Return a licence's SPDX spelling, or "" if it is not in the SPDX list."""
+    """Return a license's SPDX spelling, or "" if it is not in the SPDX list."""
     # Imported here: only the extra `evidence` requires a `packaging` that has it.
     try:
         from packaging import licenses
     except ImportError as error:
         raise MissingDependency(
             "packaging 24.2 or newer",
-            purpose="Stating a licence",
+            purpose="Stating a license",
             install='pip install "mjrec[evidence]"',
         ) from error
     try:

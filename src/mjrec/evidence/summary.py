@@ -128,7 +128,7 @@ def sampled(verification: Verification) -> str | None:
     count, seed = (verification.facts.get(key) for key in ("sample", "seed"))
     if count is None:
         return None
-    return f"{count} frames of each video were rendered, chosen by --seed {seed}"
+    return f"{count} frames of each video were rendered, chosen with --seed {seed}"
 
 
 def _line(topic: Topic, found: list[Finding]) -> tuple[str, str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging all equal and different items by the excuses, and the totals."""
+"""Judgment of all equal and different items under the excuses, and the totals."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .excuses import (
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
 
 _MOST_FAILURES: Final = 100
-# The largest share of frames that may be bitwise equal: with another rasterizer, few;
-# with the same one on another CPU, those that rounding did not change.
+# The largest credible share of bitwise equal frames. A different rasterizer leaves few
+# frames equal; a different CPU leaves those that rounding did not change.
 _MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
 _ELSEWHERE: Final = (ExcuseKind.VERSION, ExcuseKind.HARDWARE)
 
@@ -39,7 +39,7 @@ class Trial:
         self._excuses = excuses
         self._scopes = [frozenset(excuse.items) for excuse in excuses]
         self._used: Counter[int] = Counter()
-        # By excuse and unit.
+        # Keyed by excuse and unit.
         self._equal: Counter[tuple[int, str]] = Counter()
         self._other: Counter[tuple[int, str]] = Counter()
         self._sums: dict[tuple[Any, ...], Finding] = {}
@@ -54,12 +54,12 @@ class Trial:
         self._add(note)
 
     def take(self, found: Same | Difference | Finding) -> Finding | None:
-        """Count what a comparator found; return a contradiction to list separately."""
+        """Count a comparator's result; return a contradiction to list separately."""
         if isinstance(found, Same):
             is_proof = True
             for index in self._reaching(found):
                 self._equal[index, found.unit] += found.count
-                # The item was fed in, so it proves nothing.
+                # The item was copied from the archive, so it proves nothing.
                 is_proof &= not is_fed(self._excuses[index].name, found.topic)
             if is_proof:
                 count, unit, outcome = found.count, found.unit, Outcome.RECREATED
@@ -93,7 +93,7 @@ class Trial:
         return finding_under(None, found, Outcome.DIFFERENT)
 
     def totals(self) -> Iterator[Finding]:
-        """Yield the refuted claims, the merged findings, and what they mean."""
+        """Yield the refuted claims, the merged findings, and remarks on them."""
         for index, excuse in enumerate(self._excuses):
             if (reason := self._refutation(index)) is not None:
                 yield Finding(
@@ -123,7 +123,7 @@ class Trial:
 
     @property
     def excuses(self) -> tuple[Excuse, ...]:
-        """The used and refuted excuses, and all those of versions and hardware."""
+        """The used and refuted excuses, and all excuses for versions and hardware."""
         tried = (
             dataclasses.replace(
                 excuse,
@@ -167,7 +167,7 @@ class Trial:
         if excuse.name == "gl" and is_same_family(excuse):
             return None
         if excuse.name == "machine" and not others:
-            # It may be invisible: no step of the half cheetah depends on the CPU.
+            # It may be invisible: no step of HalfCheetah depends on the CPU.
             return None
         most = _MOST_EQUAL_FRAMES.get(excuse.name)
         if frames and most is not None and frames >= most * (frames + others):

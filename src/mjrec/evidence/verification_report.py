@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a verification: one HTML file that loads nothing.
+"""The report of a verification: one HTML file that loads no other files.
 
-Its content may come from a hostile archive. It is shown as text: escaped, shortened if
-long, and with invisible characters (control characters, bidirectional marks) spelled
+Its content may come from a hostile archive, so it is shown as text: escaped, shortened
+if long, and with invisible characters (control characters, bidirectional marks) spelled
 out.
 """
 
@@ -44,7 +44,7 @@ _LONGEST_TEXT: Final = 1500
 def write_verification_report(verification: Verification, path: Path) -> None:
     """Write a verification as one HTML file.
 
-    It needs neither network nor scripts, and has styles for phones, dark mode and
+    The page needs neither network nor scripts, and has styles for phones, dark mode and
     print. An existing file is replaced once the new one is complete.
 
     Raises:

@@ -76,13 +76,13 @@ def verify(
 
     The archive may come from a stranger. Three processes read it, recreate the run and
     compare the two runs. Each has limits on memory and time, no network and no home
-    directory, and sees only what it needs: the second gets only the inputs
+    directory, and sees only the data it needs: the second gets only inputs
     (environment, seeds, actions, options). No code that the archive names is run,
     except environments in `trust`.
 
     Args:
         path: an archive from `mjrec pack`, an unpacked one, a monitor directory, or a
-            folder of several. In directories, missing files cannot be detected.
+            folder with several. In directories, missing files cannot be detected.
         level: where to stop: `"files"` (the bag contains what it lists), `"stats"`
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).
@@ -156,7 +156,7 @@ def _run_all(
         on_progress: called with the progress.
 
     Returns:
-        What they sent: `findings`, `excuses`, `inputs` and `facts`.
+        The values that the processes sent: `findings`, `excuses`, `inputs` and `facts`.
     """
     heard: dict[str, Any] = {"findings": [], "excuses": [], "inputs": {}, "facts": {}}
     stages = {
@@ -191,7 +191,7 @@ def _run(
     heard: dict[str, Any],
     on_progress: Callable[[VerificationProgress], object] | None,
 ) -> str | None:
-    """Run a process and add what it sends to `heard`; return why it failed, or None."""
+    """Run a process and add its messages to `heard`; return the reason if it failed."""
     told = on_progress or (lambda _: None)
     began, failure = time.monotonic(), None
 
@@ -240,7 +240,7 @@ def _sample(sample: int | None) -> int | None:
     if isinstance(sample, bool) or operator.index(sample) < 1:
         raise InvalidArgument(
             "sample must be the number of frames to check in each video, 1 or more, "
-            f"got {sample!r}. Leave it out to check all of them."
+            f"got {sample!r}. Omit it to check all of them."
         )
     return operator.index(sample)
 
@@ -259,7 +259,7 @@ def _working_folder() -> Iterator[Path]:
     """
     parent = Path(tempfile.gettempdir())
     for folder in parent.glob(f"{_PREFIX}*"):
-        # Ignore folders that disappear meanwhile or cannot be read.
+        # Ignore folders that disappear in the meantime or cannot be read.
         with contextlib.suppress(OSError):
             if _is_abandoned(folder):
                 shutil.rmtree(folder, ignore_errors=True)

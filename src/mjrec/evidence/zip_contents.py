@@ -4,8 +4,8 @@
 Only plain archives are accepted: files and folders below one folder, one after another
 from the first byte to the table of contents, which ends the file. Some programs see
 anything else in the file (a comment, bytes before, between or after entries, two
-entries over the same bytes) and others do not, so that two readers would check
-different things.
+entries over the same bytes) and others do not, so two readers could check different
+content.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _FULL_16, _FULL_32 = 0xFFFF, 0xFFFF_FFFF
 # If bit 3 of the flags is set, a descriptor of one of four sizes follows the data.
 _DESCRIPTOR = 0x0008
 _DESCRIPTOR_SIZES = (12, 16, 20, 24)
-# Encrypted, patched, strongly encrypted, with a masked table.
+# The flags for: encrypted, patched, strongly encrypted, with a masked table.
 _UNREADABLE = 0x0001 | 0x0020 | 0x0040 | 0x2000
 
 # The extra fields that are accepted: sizes beyond 4 GiB, times and owners. Others can
 # give an entry a second name, which some programs read and others do not.
 _KNOWN_EXTRAS = (0x0001, 0x000A, 0x5455, 0x5855, 0x7855, 0x7875)
 
-# Text compresses about tenfold, deflate reaches a thousandfold at most.
+# Text compresses about tenfold, and deflate reaches at most a thousandfold.
 _ALWAYS_FINE = 1 << 26
 _MOST_EXPANSION = 100
 
@@ -55,7 +55,7 @@ def open_plain_zip(path: Path) -> Iterator[zipfile.ZipFile]:
         OSError: the file cannot be read.
     """
     with open_regular(path) as file:
-        # First, because it limits the length of what `zipfile` reads.
+        # Comes first, because it limits how much `zipfile` reads.
         table = _place_of_table(file)
         with zipfile.ZipFile(file) as archive:
             if archive.start_dir != table:
@@ -149,7 +149,7 @@ def _large_table_of(file: BinaryIO, end: int) -> tuple[int, int, int, int]:
 
 
 def _check_entry(info: zipfile.ZipInfo) -> None:
-    # zipfile cuts a name off at its first NUL; unpackers differ.
+    # zipfile truncates a name at its first NUL; other programs may not.
     name = info.orig_filename
     portable_parts(name.removesuffix("/"))
     kind = stat.S_IFMT(info.external_attr >> 16)
@@ -199,12 +199,12 @@ def _check_gap(gap: int, may_have_descriptor: bool, before: str) -> None:
 
 
 def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
-    """Return the offset of the end of an entry's data, from the header before it."""
+    """Return the end offset of an entry's data, according to the header before it."""
     assert archive.fp is not None
     archive.fp.seek(info.header_offset)
     header = archive.fp.read(_LOCAL.size)
     if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
-        raise ValueError(f"{info.filename!r} is not at its stated place")
+        raise ValueError(f"{info.filename!r} is not at its stated position")
     fields = _LOCAL.unpack(header)
     name = archive.fp.read(fields[-2])
     encoding = "utf-8" if fields[2] & 0x0800 else "cp437"

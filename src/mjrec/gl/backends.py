@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of the OpenGL backends, the variables that select one, and their failures.
+"""The OpenGL backends: their names, the variables that select them, and failures.
 
 Messages from MuJoCo and the drivers rarely name a failure's cause or fix. A missing
 library shows up as `'NoneType' object has no attribute 'eglQueryString'`, and a wrong
@@ -120,7 +120,7 @@ class Diagnosis:
 def diagnose(
     text: str, *, backend: str | None = None, environ: Mapping[str, str] | None = None
 ) -> Diagnosis | None:
-    """Return the cause and fix of an OpenGL failure, or None if it is unknown.
+    """Return the cause and fix of an OpenGL failure, or None if they are unknown.
 
     Args:
         text: the exception's text, or a process's whole output.
@@ -164,7 +164,7 @@ def diagnose(
 
 @functools.cache
 def _table() -> list[dict[str, str]]:
-    """Return the rows of `diagnosis.toml`, with its words filled in."""
+    """Return the rows of `diagnosis.toml`, with their placeholders filled in."""
     file = Path(__file__).with_name("diagnosis.toml")
     content = tomllib.loads(file.read_text("utf-8"))
     words: dict[str, str] = content["words"]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choice of this process's OpenGL backend, based on tests in child processes.
 
-A child is used because a driver may crash or hang.
+A child process is used because a driver may crash or hang.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Probe:
 
     Attributes:
         backend: the backend's name.
-        renders: whether a test frame with several colours was correct.
-        gl_renderer: the renderer's name in OpenGL; empty if unknown.
+        renders: whether a test frame with several colors was rendered correctly.
+        gl_renderer: the renderer's name as reported by OpenGL; empty if unknown.
         gl_vendor: the renderer's vendor.
         gl_version: the version of OpenGL, including the driver's.
         frames_per_second: rendering speed for a small scene at 480x480 pixels and
@@ -79,7 +79,7 @@ class Probe:
         )
 
     def warning(self) -> str:
-        """Return a warning if the backend uses the CPU despite a GPU, otherwise ""."""
+        """Return a warning if the backend uses the CPU despite a GPU, else ""."""
         files = gpu_device_files() if self.software else []
         if not files:
             return ""
@@ -106,7 +106,7 @@ class Probe:
 def probe(
     backend: str, *, environ: Mapping[str, str] | None = None, measure: bool = False
 ) -> Probe:
-    """Test `backend` as `use_gl` would set it, and cache the result in this process.
+    """Test `backend` as set by `use_gl`, and cache the result in this process.
 
     A cached result is used only if all environment variables are unchanged.
 
@@ -138,7 +138,7 @@ def probe_environment(
     """Test the backend that `environ` names in `MUJOCO_GL`, with only these variables.
 
     Args:
-        environ: the child's environment variables, which are not corrected.
+        environ: the child's environment variables, which are used unchanged.
         measure: whether to measure the speed too.
         timeout: maximum time to wait for a frame, in seconds.
     """
@@ -210,8 +210,8 @@ def use_gl(backend: str | None = None) -> str:
     The choice is `backend` if given, otherwise the environment variable `MUJOCO_GL` if
     set, otherwise the first of EGL, OSMesa and GLFW that works. A child process first
     renders a test frame with the backend, which takes about a second, once per process.
-    So if a backend is returned, it works. Otherwise an error gives the cause and the
-    fix. To skip the test, set `MUJOCO_GL` and do not call this function.
+    So if a backend is returned, it works. Otherwise, an error explains the cause and
+    the fix. To skip the test, set `MUJOCO_GL` and do not call this function.
 
     This function sets `MUJOCO_GL` and `PYOPENGL_PLATFORM`, and changes neither if it
     raises an error. Call it before anything imports mujoco, dm_control or OpenGL. If
@@ -225,8 +225,8 @@ def use_gl(backend: str | None = None) -> str:
         UnknownName: `backend` or `MUJOCO_GL` is not the name of a backend.
         GLError: `MUJOCO_GL` turns rendering off; mujoco, dm_control or PyOpenGL was
             imported with another backend; the requested backend does not work; or no
-            backend was requested and none works. The message gives the cause and fix
-            for each.
+            backend was requested and none works. The message gives each failure's cause
+            and fix.
     """
     choice = choose(backend)
     _log(choice)
@@ -237,7 +237,7 @@ def use_gl(backend: str | None = None) -> str:
 def backend_for_children() -> str:
     """Return the first working backend, for processes that render for this one.
 
-    This process's imports and its `MUJOCO_GL` do not matter.
+    This ignores the process's imports and its `MUJOCO_GL`.
 
     Raises:
         GLError: no backend works.
@@ -301,7 +301,7 @@ def conflict_with(backend: str) -> Diagnosis | None:
 
 
 def _taken() -> dict[str, str | None]:
-    """Return the backend that each imported package uses, by package.
+    """Return the backend that each imported package uses, keyed by package.
 
     None means that a package was imported without a backend, because `MUJOCO_GL` turned
     rendering off or because importing the backend failed.
@@ -330,7 +330,7 @@ def _nothing_renders(
     asked: str | None, reason: str, rejected: list[tuple[str, Diagnosis]]
 ) -> str:
     if asked:
-        first = f"OpenGL backend {asked} ({reason}) cannot be used here."
+        first = f"The OpenGL backend {asked} ({reason}) cannot be used here."
         last = "Run `mjrec doctor` to see which backends work here."
     else:
         first = "No OpenGL backend can be used here."

@@ -3,11 +3,11 @@
 
 Schedulers assign GPUs with `CUDA_VISIBLE_DEVICES`, which EGL ignores: by default, all
 workers on a machine render on the same GPU, the first one. The EGL device of the
-assigned GPU cannot be computed, because three numberings are involved. The scheduler's
-entry is CUDA's number or a UUID. EGL has its own order. `MUJOCO_EGL_DEVICE_ID` is an
-index into EGL's devices in mujoco 3, but into CUDA's devices, if possible, in mujoco 4.
+assigned GPU cannot be computed, because three numbering schemes are involved. The
+scheduler gives a CUDA number or a UUID. EGL has its own order. `MUJOCO_EGL_DEVICE_ID`
+is an index into EGL's devices in mujoco 3, but (if possible) into CUDA's in mujoco 4.
 So a child process that sees only the assigned GPU asks the driver which EGL device has
-a CUDA number. Another child process then renders, and its driver reports the device.
+a CUDA number. A second child then renders, and its driver reports the device it used.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def render_on_given_gpu(
     """Make this process and its children render on the GPU that they were assigned.
 
     Sets `MUJOCO_EGL_DEVICE_ID` to the EGL device of that GPU, and `MUJOCO_GL` to `egl`
-    unless it turns rendering off in this process. If the GPU cannot be used, nothing is
-    set and one warning says why. This takes a second or two, in child processes. Call
-    it before anything imports mujoco, dm_control or OpenGL.
+    unless that variable turns rendering off. If the GPU cannot be used, nothing is set
+    and one warning gives the reason. This takes a second or two, in child processes.
+    Call it before anything imports mujoco, dm_control or OpenGL.
 
     Args:
-        gpu: one entry as in `CUDA_VISIBLE_DEVICES`: a number ("3"), or the UUID of a
-            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None means the first
-            entry of that variable or, if it is not set, CUDA's first GPU.
+        gpu: one entry in the form of `CUDA_VISIBLE_DEVICES`: a number ("3"), or the
+            UUID of a GPU ("GPU-1a2b...") or of a GPU partition ("MIG-..."). None means
+            that variable's first entry or, if it is not set, CUDA's first GPU.
         required: whether to raise an error if the GPU cannot be used.
 
     Returns:
@@ -77,10 +77,10 @@ def visible_gpus(
 ) -> list[str]:
     """Return this machine's NVIDIA GPUs that can be assigned to workers.
 
-    Each is returned as an entry for a worker's `CUDA_VISIBLE_DEVICES`. They are this
-    process's own entries or, if the variable is not set, CUDA's numbers for the GPUs
-    whose device files this process may open. A container or a job sees only its own
-    device files, and CUDA counts them from 0.
+    Each is returned as an entry for a worker's `CUDA_VISIBLE_DEVICES`. The entries are
+    this process's own or, if the variable is not set, CUDA's numbers for the GPUs whose
+    device files this process may open. A container or a job sees only its own device
+    files, and CUDA numbers them from 0.
 
     Args:
         environ: the environment variables; if None, this process's.
@@ -123,8 +123,8 @@ def _entry(gpu: str | None) -> str:
     if entry.isdecimal() or (entry.startswith(_UUIDS) and "," not in entry):
         return entry
     raise InvalidArgument(
-        f"gpu must be one entry as in {CUDA_VISIBLE_DEVICES}, a number or a UUID that "
-        f"starts with GPU- or MIG-, not {gpu!r}."
+        f"gpu must be a single entry in the form of {CUDA_VISIBLE_DEVICES} (a number, "
+        f"or a UUID that starts with GPU- or MIG-), not {gpu!r}."
     )
 
 
@@ -143,7 +143,7 @@ def _entries(environ: Mapping[str, str]) -> list[str] | None:
 
 
 def _can_be_opened(file: Path) -> bool:
-    # A cgroup's restriction shows only when the file is opened.
+    # A cgroup's restriction takes effect only when the file is opened.
     try:
         os.close(os.open(file, os.O_RDWR | os.O_CLOEXEC))
     except OSError:
@@ -156,8 +156,8 @@ def _refuse_latecomers() -> None:
     conflict = conflict_with("egl")
     if conflict and not rendering_is_off(os.environ):
         raise GLError(f"{conflict.cause} {conflict.fix}")
-    # mujoco reads the number when it creates its first context, and dm_control reads it
-    # on import.
+    # mujoco reads `MUJOCO_EGL_DEVICE_ID` when it creates its first context, and
+    # dm_control reads it on import.
     mujoco_draws = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
     dm_control = "dm_control._render.pyopengl.egl_renderer" in sys.modules
     if mujoco_draws is not None or dm_control:
@@ -246,8 +246,8 @@ def _lack_of_device(alone: Probe) -> str:
         return f"EGL has only the CPU{on}. {way}"
     return (
         f"none of EGL's {len(hardware)} GPUs is that GPU: "
-        f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) usually do not "
-        f"support graphics, and GPUs that CUDA does not show cannot be found. {_DOCTOR}"
+        f"{'; '.join(map(_shown, hardware))}. Partitions of a GPU (MIG) usually do not "
+        f"support graphics, and GPUs hidden from CUDA cannot be found. {_DOCTOR}"
     )
 
 

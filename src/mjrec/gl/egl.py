@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EGL's devices, as listed by its library.
+"""The devices that the EGL library lists.
 
 This uses only ctypes, so it works even if mujoco and PyOpenGL cannot be imported.
 """
@@ -51,7 +51,7 @@ def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
     The result is empty if EGL is not installed or cannot list its devices.
 
     Args:
-        with_cuda: whether to ask for CUDA's numbers. The driver then initializes CUDA,
+        with_cuda: whether to query CUDA's numbers. The driver then initializes CUDA,
             so processes that are forked afterwards can no longer use CUDA.
     """
     try:

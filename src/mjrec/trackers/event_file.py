@@ -58,7 +58,7 @@ class EventFile:
     def write_scalars(
         self, values: Mapping[str, float], *, step: int, wall_time: float
     ) -> None:
-        """Write scalars, by tag."""
+        """Write scalars, keyed by tag."""
         pairs = values.items()
         summaries = [summary_pb2.Summary.Value(tag=k, simple_value=v) for k, v in pairs]
         self._write_summary(*summaries, step=step, wall_time=wall_time)

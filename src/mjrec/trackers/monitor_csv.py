@@ -24,15 +24,15 @@ from ..atomic_files import AppendOnlyFile
 from ..formats.monitor_directory import FILE_PREFIX
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
 
-# Stable-Baselines3 reads every file in a directory whose name ends like this.
+# Stable-Baselines3 reads every file in a directory whose name ends with this.
 _ENDING = "monitor.csv"
 
 
 class MonitorCsvTracker(Tracker):
     """A tracker that writes files for `stable_baselines3.common.monitor.load_results`.
 
-    Each run has its own file. A sub-environment counts as a run, and so does a run that
-    adds to earlier recordings. `load_results` reads all files in a directory and orders
+    Each run has its own file. Each sub-environment is a separate run, and so is each
+    resumption of a recording. `load_results` reads all files in a directory and orders
     episodes by their end times. An existing file is never changed. An episode's
     complete row is on disk as soon as the episode has ended.
 

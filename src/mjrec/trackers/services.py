@@ -35,7 +35,7 @@ def group_of(episode: FinishedEpisode | None) -> str:
 
 
 def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
-    """Return an episode's scalars by name."""
+    """Return an episode's scalars, keyed by name."""
     scalars = {"return": float(episode.reward), "length": float(episode.length)}
     if episode.success is not None:
         scalars["success"] = float(episode.success)

@@ -20,7 +20,7 @@ from .services import group_of, name_of, require, scalars_of
 if TYPE_CHECKING:
     from .event_file import EventFile
 
-# The maximum number of videos that wait for their previews.
+# The maximum number of videos waiting for a preview.
 _MOST_WAITING = 100
 _MOST_BYTES = 2 << 20
 # Lengths of a preview's longer side in pixels, tried in order until the GIF is small
@@ -158,7 +158,7 @@ def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
         fps: the video's frames per second.
 
     Raises:
-        EncoderError: ffmpeg failed or hangs.
+        EncoderError: ffmpeg failed or hung.
     """
     delay = _delay(frame_count, fps)
     for side in _SIDES:

@@ -20,8 +20,8 @@ class WandbTracker(Tracker):
     `training/return`, `training/length` and, if the environment reports it,
     `training/success` are logged against the run's steps (`training/total_steps`).
     Evaluation episodes use `evaluation/`, and sub-environments use `training/env<i>/`.
-    Each mp4 is uploaded as `training/video`. Its steps are in
-    `training/video_total_steps`, because a deferred video is finished after later
+    Each mp4 is uploaded as `training/video`. Its number of steps is logged separately,
+    as `training/video_total_steps`, because a deferred video is finished after later
     episodes.
 
     Each call uses W&B's next step. W&B drops data with a lower step, so code that logs
@@ -29,9 +29,9 @@ class WandbTracker(Tracker):
 
     Args:
         run: a run from `wandb.init`, which stays open. If None and no other arguments
-            are given, the run that is active when the first monitor starts is used, if
-            there is one. Otherwise a new run is created. It is finished when the last
-            monitor ends.
+            are given, the tracker uses the run that is active when the first monitor
+            starts, if there is one. Otherwise it creates a new run, and finishes it
+            when the last monitor ends.
         project: the new run's project, as in `wandb.init`.
         mode: the new run's mode, as in `wandb.init`, such as `"offline"`.
         **init: other arguments of `wandb.init`.
@@ -64,7 +64,7 @@ class WandbTracker(Tracker):
                 f"arguments for a new one, not {run!r}."
             )
         self._given = run
-        # W&B's run while monitors are open, and the process that must finish it.
+        # W&B's run while monitors are open, and the process that has to finish it.
         self._service: Any = None
         self._owner: int | None = None
         self._axes: set[str] = set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the episodes of a directory that have recorded states."""
+"""Search for the episodes in a directory that have recorded states."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _SHOWN = 10
 
 
 def recorded_episodes(directory: Path) -> list[Path]:
-    """Return a directory's trajectories, finished or in flight.
+    """Return the trajectories in a directory, finished or in flight.
 
-    They are grouped by monitor, with the most recently written one last, and sorted by
-    episode number.
+    They are grouped by monitor, with the most recently written monitor last, and sorted
+    by episode number.
 
     Args:
         directory: a monitor directory, or one with several, such as an evaluation.
@@ -42,7 +42,7 @@ def _written_at(files: MonitorFiles) -> int:
 
 
 def trajectory_in(target: Path, episode: int | None) -> Path:
-    """Return the chosen trajectory: a file, or an episode of a directory.
+    """Return the requested trajectory: a file, or an episode in a directory.
 
     Args:
         target: the file or the directory.
@@ -56,7 +56,7 @@ def trajectory_in(target: Path, episode: int | None) -> Path:
     if not target.is_dir():
         if episode is not None:
             raise InvalidArgument(
-                f"{target} is a single episode. Leave --episode out, or name its "
+                f"{target} is a single episode. Omit --episode, or give the file's "
                 "directory."
             )
         return target
@@ -70,12 +70,12 @@ def trajectory_in(target: Path, episode: int | None) -> Path:
     if not those:
         known = sorted({str(episode_of(path.name)) for path in found}, key=int)
         raise InvalidArgument(
-            f"{target} has no recorded states of episode {episode}. Recorded episodes: "
+            f"{target} has no recorded states for episode {episode}. Available: "
             f"{', '.join(known[:_SHOWN])}{' ...' if len(known) > _SHOWN else ''}."
         )
     if len(those) > 1:
         names = ", ".join(path.name for path in those[:_SHOWN])
         raise InvalidArgument(
-            f"Several monitors have an episode {episode}. Name one of {names}."
+            f"Several monitors have an episode {episode}. Choose one of {names}."
         )
     return those[0]

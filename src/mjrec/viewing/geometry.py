@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene of meshes: MuJoCo's geoms, sites, skins and flexes, with their colours.
+"""A scene of meshes: MuJoCo's geoms, sites, skins and flexes, with their colors.
 
 mjviser creates the meshes of primitives, height fields and sites. This module adds the
 rest: normals and texture coordinates of meshes, cube textures, planes of the model's
-size, and colours as mixed by MuJoCo's visualizer.
+size, and the colors that MuJoCo's visualizer would mix.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _SIDES = (
 
 
 def scene_page(stage: Stage, motion: Motion) -> str:
-    """Return an HTML page with all shapes of a stage, in the motion's first state."""
+    """Return an HTML page with all shapes on a stage, in the motion's first state."""
     # viser prints a report about its server, which nothing ever connects to.
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -79,7 +79,7 @@ def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
     scene.set_background_image(sky(model))
     for shape in stage.soft:
         mesh = soft_mesh(model, shape)
-        # Without MuJoCo's normals, its own shadow would show as stripes on it.
+        # Without MuJoCo's normals, the mesh's own shadow would appear on it as stripes.
         scene.add_mesh_trimesh(shape.name, mesh, receive_shadow=False)
     for shape in (*stage.shapes, *stage.passing.values()):
         pose = motion.poses[shape.name][0]
@@ -98,12 +98,12 @@ def _casts_shadow(shape: Shape) -> bool:
 
 
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
-    """Return a shape's mesh in its own frame, with its colour or texture.
+    """Return a shape's mesh in its own frame, with its color or texture.
 
     Args:
         model: the model that the shape belongs to.
-        shape: a geom or a site. Anything else becomes a unit mesh, which its scale
-            brings to size: an icosphere of radius 1, a box of half size 1, or a
+        shape: the shape. If it is neither a geom nor a site, the result is a unit mesh
+            for the page to scale: an icosphere of radius 1, a box of half size 1, or a
             cylinder of radius 1 and half length 1.
     """
     if shape.object_type == _SITE:
@@ -123,7 +123,7 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
     if texture is None:
         return _finished(mesh, shape)
     if int(model.tex_type[texture]) != _TEXTURE_2D:
-        # If all sides are equal, there is only one.
+        # A texture whose sides are all equal contains only one.
         sides = int(model.tex_height[texture]) // int(model.tex_width[texture])
         mesh, uv = _on_cube(mesh, sides)
     elif uv is None:
@@ -134,7 +134,7 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
 def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
     """Return the mesh of a skin in its resting pose, or of a flex.
 
-    Its vertices are moved by each state.
+    Each state moves its vertices.
     """
     index = shape.object_id
     if shape.geom_type == _FLEX:
@@ -154,7 +154,7 @@ def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
 
 
 def linear(rgba: Any) -> list[float]:
-    """Return a colour for the page, whose lighting is linear, unlike MuJoCo's."""
+    """Return a color for the page, whose lighting is linear, unlike MuJoCo's."""
     red, green, blue, alpha = (float(channel) for channel in rgba)
     return [*(max(0.0, c) ** _GAMMA for c in (red, green, blue)), alpha]
 
@@ -167,7 +167,7 @@ def sky(model: mujoco.MjModel) -> NDArray[np.uint8]:
     texture = kinds.index(int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     pixels = np.asarray(_image(model, texture))
     width = pixels.shape[1]
-    # The second side from the end is an upright one.
+    # The second-to-last side is a vertical one.
     side = pixels[-2 * width : -width] if len(pixels) == 6 * width else pixels
     column = side.mean(axis=1, keepdims=True).astype(np.uint8)
     return np.repeat(column, 2, axis=1)
@@ -179,10 +179,10 @@ def _finished(
     uv: NDArray[Any] | None = None,
     image: Image.Image | None = None,
 ) -> trimesh.Trimesh:
-    """Return a mesh with its colour, and its texture if there is one."""
+    """Return a mesh with its color, and its texture if there is one."""
     rgba, texture = shape.rgba, None
     if image is not None:
-        # glTF's texture origin is the top of the image, trimesh's is the bottom.
+        # glTF's texture origin is at the top of the image, and trimesh's at the bottom.
         texture = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
     material = PBRMaterial(
         baseColorFactor=linear(rgba),
@@ -246,8 +246,8 @@ def _asset_mesh(
 
 def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
     """Return the triangles of a 2D flex, or of a 3D flex's shell."""
-    # `flex_vert` is zero where each vertex has a body. A mesh with equal vertices and
-    # normals shares their memory in the page, which then loses the vertices.
+    # `flex_vert` is zero if each vertex has a body. A mesh whose vertices equal its
+    # normals would share their memory in the page, which then loses the vertices.
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_flex(model, data)
@@ -296,7 +296,7 @@ def _repeated(
     """Return a mesh split for a repeated 2D texture, and its texture coordinates.
 
     Each side of a primitive shows the texture. On a height field, or a mesh without
-    texture coordinates, it is projected along z.
+    texture coordinates, the texture is projected along z.
     """
     material = int(model.geom_matid[shape.object_id])
     half = np.maximum(mesh.extents[:2] / 2, 1e-9)

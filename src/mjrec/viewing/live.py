@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live view: a local, read-only web server that shows a run in progress.
 
-It reads the journal and row logs like any other reader, at a low priority, and the
-monitor does not notice it. A page polls for new states. Between requests it waits
-several times as long as the last answer took.
+It reads the journal and row logs like any other reader, at a low priority and without
+disturbing the monitor. A page polls for new states. After each response, it waits
+several times as long as the response took.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .replay import ending_of, motion_chunk, replay_page
 
 _ADDRESS = "127.0.0.1"
 _NICENESS = 10
-# Limits of one answer; a page asks again for the rest.
+# Limits of one response; a page requests the rest later.
 _MOST_STATES = 500
 _MOST_EPISODES = 200
 _MOST_POINTS = 1000
@@ -43,7 +43,7 @@ _MOST_POINTS = 1000
 
 @dataclass
 class _Shown:
-    """The episode that was requested last, and the next state of its stage."""
+    """The episode that was requested most recently, and the next state of its stage."""
 
     path: Path
     stage: Stage
@@ -91,7 +91,7 @@ class LiveView:
             self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
         except OSError as error:
             raise InvalidArgument(
-                f"Port {port} cannot be used ({error.strerror}). Leave it out to use "
+                f"Port {port} cannot be used ({error.strerror}). Omit the port to use "
                 "any free port."
             ) from error
         self._server.daemon_threads = True
@@ -107,7 +107,7 @@ class LiveView:
     def close(self) -> None:
         """Stop answering requests. Idempotent."""
         if self._has_served:
-            # Otherwise it would wait forever for the end of `serve`.
+            # If `serve` was never called, `shutdown` would wait forever.
             self._server.shutdown()
         self._server.server_close()
 
@@ -135,7 +135,7 @@ class LiveView:
                     self.send_error(HTTPStatus.NOT_FOUND)
                     return
                 except (Error, OSError) as error:
-                    # A file may disappear while it is read; the page asks again.
+                    # A file may disappear while it is being read; the page retries.
                     kind, body = "application/json", json.dumps({"error": str(error)})
                 content = body.encode()
                 self.send_response(HTTPStatus.OK)
@@ -155,7 +155,7 @@ class LiveView:
         return Handler
 
     def _answer(self, page: str, asked: dict[str, str]) -> str:
-        """Return the answer to a page's request.
+        """Return the response to a page's request.
 
         Raises:
             KeyError: the page or episode does not exist.
@@ -244,7 +244,7 @@ class LiveView:
 
 
 def be_nice() -> None:
-    """Lower this process's priority below everything else on this machine."""
+    """Lower this process's priority below that of all others on this machine."""
     os.nice(_NICENESS)
 
 

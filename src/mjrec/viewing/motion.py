@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion of all drawn shapes: poses and colours in each recorded state.
+"""The motion of all drawn shapes: poses and colors in each recorded state.
 
-MuJoCo's own visualizer selects the shapes, with the recorded environment's options. So
-the same groups, tendons and sites are hidden as in its videos.
+MuJoCo's own visualizer selects the shapes, using the recorded environment's options. So
+the same groups, tendons and sites are hidden as in the environment's videos.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Shape:
         object_type: the object's `mjtObj`, such as a geom, site or tendon.
         object_id: the object's id in the model.
         geom_type: the shape's `mjtGeom`.
-        rgba: colour from MuJoCo's visualizer, materials included.
+        rgba: color from MuJoCo's visualizer, including materials.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """N states of a recorded episode, in the form that a page shows.
+    """N states of a recorded episode, in the form that a page uses.
 
     Attributes:
         steps: `(N,)`, number of steps before each state.
@@ -71,7 +71,7 @@ class Motion:
             absent.
         cameras: `(N, cameras, 7)`, poses of the model's cameras, which look along -z.
         target: `(N, 3)`, the point that the tracking camera follows.
-        colours: colour changes: index of the state, name of the shape, and RGBA from
+        colours: color changes: index of the state, name of the shape, and RGBA from
             that state on.
     """
 
@@ -102,7 +102,7 @@ class Stage:
         passing: shapes seen in only some states, with a different size in each, such as
             tendons.
         soft: skins and flexible bodies.
-        notes: notes on what cannot be shown.
+        notes: remarks on features that cannot be shown.
         view: the recorded camera's initial position, the point it looks at, and its
             `fovy`.
 
@@ -119,7 +119,7 @@ class Stage:
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MOST_GEOMS)
         self._changes_seen = 0
         with open_vetted_trajectory(trajectory.path) as reader:
-            # This is for the camera and the options; the model has its fields already.
+            # This is for the camera and the options; the model's fields are set.
             self._change_model(reader, 0)
         self._enter(trajectory, 0)
         drawn = list(self._drawn())
@@ -144,7 +144,7 @@ class Stage:
 
     @property
     def camera_number(self) -> int | None:
-        """Index of the fixed camera of the recorded videos; None for other cameras."""
+        """Index of the fixed camera used in the videos; None for other cameras."""
         is_fixed = self._camera.type == int(mujoco.mjtCamera.mjCAMERA_FIXED)
         return int(self._camera.fixedcamid) if is_fixed else None
 
@@ -169,10 +169,10 @@ class Stage:
         """Return the motion of all shapes in some states of the same episode.
 
         Args:
-            trajectory: the trajectory with these states; it may have grown since the
-                stage was created.
-            steps: `(N,)`, ascending indices of the states, not before any state that
-                was requested earlier.
+            trajectory: the trajectory that contains these states; it may have grown
+                since the stage was created.
+            steps: `(N,)`, ascending indices of the states. They must not precede
+                any state that was requested before.
 
         Raises:
             UnreadableFile: the file is missing or damaged.
@@ -247,7 +247,7 @@ class Stage:
             trajectory.set_state(self.data, step)
         except InvalidArgument as error:
             raise UnreadableFile(trajectory.path, error) from error
-        # Computes what depends on positions only, without contacts.
+        # Computes only what depends on positions, without contacts.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -312,9 +312,9 @@ def _recorded_view(
     try:
         view = view_from_facts(scene)
         check_camera(model, view.camera)
-    # NumPy and the bindings reject more than is checked explicitly.
+    # NumPy and the bindings reject more invalid values than are checked explicitly.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise UnreadableFile(trajectory.path, f"its scene: {error}") from error
+        raise UnreadableFile(trajectory.path, f"in its scene: {error}") from error
     return view.camera, view.option
 
 

@@ -41,13 +41,13 @@ _POLICY = (
 
 @dataclass(frozen=True)
 class Replay:
-    """A replay page that was written.
+    """A replay page that has been written.
 
     Attributes:
         path: the page.
         states: number of states that it shows.
         size: size in bytes.
-        notes: notes on what the page does not show.
+        notes: remarks on features that the page does not show.
     """
 
     path: Path
@@ -65,8 +65,8 @@ def write_replay(
     """Write a page that shows a recorded episode in 3D.
 
     The page is a single file and needs no network. It shows the same geometry as the
-    videos, in all recorded states, from any direction and from the model's cameras,
-    with rewards. It is only a view of the recorded states and not separate evidence.
+    videos, with rewards, in all recorded states, from any direction and from the
+    model's cameras. It is only a view of the recorded states, not separate evidence.
 
     Args:
         trajectory: the episode, from `load_trajectory`.
@@ -203,8 +203,8 @@ def _packed(array: NDArray[Any], kind: str = "<f4") -> str:
 def _skin(stage: Stage, skin: int) -> dict[str, Any]:
     """Return the weights with which bones move a skin's vertices.
 
-    `bind` is each bone's resting pose, and `counts` the number of vertices that each
-    bone moves; `ids` and `weights` are of these vertices, bone after bone.
+    `bind` is each bone's resting pose, and `counts` is the number of vertices that each
+    bone moves. `ids` and `weights` list these vertices, bone by bone.
     """
     model = stage.model
     first, count = model.skin_boneadr[skin], model.skin_bonenum[skin]
