@@ -271,6 +271,12 @@ class StateRecorder:
             if not self._run.tolerates(self._what, error):
                 raise
 
+    def lose(self, error: Exception) -> None:
+        """Record nothing from now on, because of an error."""
+        self.early_end = ending(error)
+        # Now, because the process may end before the recording does.
+        self._break(str(error), exception=self.early_end["exception"])
+
     def drop(self) -> None:
         """Discard the rows, even after the recording has ended.
 
@@ -297,16 +303,15 @@ class StateRecorder:
         except PicturesDiffer as error:
             self.end_frames(str(error))
         except FileNotWritten as error:
-            self.early_end = ending(error)
-            self._break(str(error))
+            self.lose(error)
             if not self._run.tolerates(self._what, error):
                 raise
 
-    def _break(self, reason: str) -> None:
+    def _break(self, reason: str, **facts: Any) -> None:
         # The first error ended the frames.
         if self.broken_reason is None:
             self.broken_reason = reason
-            self.note(broken_reason=reason)
+            self.note(broken_reason=reason, **facts)
 
     def _new_fast_path(self, span: SpanWriter) -> FastPath | None:
         start, action = self._start, self._action
