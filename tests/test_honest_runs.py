@@ -40,6 +40,7 @@ THOROUGH = [
     (honest.encoder_killed, PARTLY, BROKEN, {}, {}),
     (honest.encoder_killed, PARTLY, BROKEN, {}, STATS),
     (honest.frame_missing, PARTLY, BROKEN, {}, {}),
+    (honest.end_written_late, PASS, (), {}, {}),
     (honest.unseeded, PARTLY, {"unseeded beginning"}, {}, {}),
     (honest.early, PARTLY, {"early reset"}, {}, {}),
     (honest.wrapped, PASS, (), {}, {}),
