@@ -293,6 +293,16 @@ def _on_a_full_disk(directory, longest, full, **options):
                         monitor.step(generator.uniform(-1, 1, 6).astype(np.float32))
 
 
+def trajectory_lost(directory):
+    """Record on when the disk was full during the second of three episodes."""
+    _on_a_full_disk(directory, 4, range(-1, 4))
+
+
+def end_lost(directory):
+    """Record on when no rows could be written from the middle of an episode on."""
+    _on_a_full_disk(directory, 200, range(2, 198), max_fps=1)
+
+
 def end_written_late(directory):
     """Record on when the disk was full at the last step of an episode."""
     _on_a_full_disk(directory, 4, range(3, 4))

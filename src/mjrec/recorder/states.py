@@ -273,9 +273,16 @@ class StateRecorder:
             if not self._run.tolerates(self._what, error):
                 raise
 
-    def lose(self, error: Exception) -> None:
-        """Record nothing from now on, because of an error."""
+    def lose(self, error: Exception, *, all_rows: bool = False) -> None:
+        """Record nothing from now on, because of an error.
+
+        Args:
+            error: the error.
+            all_rows: whether not even the reset's row was written.
+        """
         self.early_end = ending(error)
+        if all_rows:
+            self._take_back()
         # Now, because the process may end before the recording does.
         self._break(str(error), exception=self.early_end["exception"])
 
