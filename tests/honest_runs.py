@@ -8,7 +8,9 @@ import signal
 import gymnasium
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 from processes import kill_children
+from waiting import wait_until
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
@@ -267,6 +269,43 @@ def frame_missing(directory):
 
     vars(env.unwrapped)["render"] = render
     play(_monitored(env, directory, render="live", on_error="warn"), 2)
+
+
+def _on_a_full_disk(directory, longest, full, **options):
+    """Record three episodes. In the second one, the disk is full at these steps.
+
+    Its reset is step -1.
+    """
+    env, generator = _made(_CHEETAH, longest), np.random.default_rng(5)
+    with _monitored(env, directory, on_error="warn", **options) as monitor:
+        for episode in range(3):
+            with contextlib.ExitStack() as limits:
+                for step in range(-1, longest):
+                    if (episode, step) == (1, full.start):
+                        # A thread stores it, and this is not about that.
+                        wait_until(lambda: list(directory.glob("*.mjb.gz")))
+                        limits.enter_context(file_size_limit(200))
+                    if (episode, step) == (1, full.stop):
+                        limits.close()
+                    if step < 0:
+                        monitor.reset(seed=episode)
+                    else:
+                        monitor.step(generator.uniform(-1, 1, 6).astype(np.float32))
+
+
+def trajectory_lost(directory):
+    """Record on when the disk was full during the second of three episodes."""
+    _on_a_full_disk(directory, 4, range(-1, 4))
+
+
+def end_lost(directory):
+    """Record on when no rows could be written from the middle of an episode on."""
+    _on_a_full_disk(directory, 200, range(2, 198), max_fps=1)
+
+
+def end_written_late(directory):
+    """Record on when the disk was full at the last step of an episode."""
+    _on_a_full_disk(directory, 4, range(3, 4))
 
 
 def text(directory):

@@ -2,6 +2,7 @@
 """A recording that fails: the simulation stops, or goes on, as the user wants."""
 
 import contextlib
+import os
 import shutil
 from unittest import mock
 
@@ -20,6 +21,7 @@ from waiting import wait_until
 
 import mjrec
 from mjrec import EncoderError, FileNotWritten, Monitor, RenderError
+from mjrec.formats.span_writer import SpanWriter
 
 both_ways = pytest.mark.parametrize("on_error", ["raise", "warn"])
 
@@ -230,6 +232,34 @@ def test_a_full_disk_at_a_live_video(what, on_error, make_corridor, out):
     assert (out / "rl-video-episode-1.mp4").exists() == is_whole
     assert not list(out.glob(".*"))
     assert not mjrec.recover(out)
+
+
+@both_ways
+def test_a_full_disk_is_named_though_the_process_ends(on_error, out):
+    """Of a counted episode, whose end found no room."""
+    child = os.fork()
+    if child == 0:
+        env = gymnasium.make("HalfCheetah-v5", max_episode_steps=300)
+        monitor = Monitor(env, out, mode="evaluation", workers=0, on_error=on_error)
+        # The first step makes the log.
+        run(monitor, 1)
+        full = FileNotWritten(out, "full")
+        # There is room for lines of the journal, and not for rows.
+        with (
+            file_size_limit(100_000),
+            mock.patch.object(SpanWriter, "end", side_effect=full),
+        ):
+            for _ in range(299):
+                with contextlib.suppress(FileNotWritten):
+                    go_on(monitor, 1)
+        os._exit(0)
+    os.waitpid(child, 0)
+    mjrec.recover(out)
+    assert stats_of(out)["episode_lengths"] == [300]
+    [path] = out.glob("*.h5")
+    facts = mjrec.load_trajectory(path).facts
+    assert (facts["complete"], facts["reason"]) == (False, "exception")
+    assert ".log" in facts["exception"]["message"]
 
 
 def test_a_disk_without_any_room(pendulum, out):

@@ -380,17 +380,43 @@ def call_it_broken(run):
 
 def blame_the_schedule(run):
     """For the video and the trajectory of an episode that should not be seen."""
-    run.remove_video(1)
     run.trajectory(1).unlink()
-    fault = {"episode_id": 1, "what": "video", "reason": "no idea"}
+    blame_a_fault(run, "video")
+
+
+def blame_a_fault(run, what="trajectory"):
+    """For a video that should not be seen."""
+    run.remove_video(1)
+    fault = {"episode_id": 1, "what": what, "reason": "no idea"}
 
     def edit(lines):
         [at] = [n for n, line in enumerate(lines) if line.get("episode_id") == 1]
-        del lines[at]["recording"]
+        if what == "video":
+            del lines[at]["recording"]
+        else:
+            run.edit_rows(1, facts={"video": None})
         lines.insert(at, {"fault": fault})
 
     run.edit_journal(edit)
     run.edit_details(faults=[fault])
+
+
+def blame_another_episode(run):
+    """For the fault that cost a trajectory its end."""
+
+    def edit(facts):
+        if facts.get("what") == "trajectory":
+            facts["episode_id"] = 2
+
+    run.say_everywhere(edit)
+
+
+def leave_faults_out(run):
+    def edit(lines):
+        lines[:] = [line for line in lines if "fault" not in line]
+
+    run.edit_journal(edit)
+    run.edit_details(faults=[])
 
 
 def pending_worst(bag):
@@ -703,6 +729,7 @@ QUICK = {
     *("an action edited", "an action edited, with a wrapper claimed"),
     *("last states called unknown", "one pixel changed", "a body made invisible"),
     *("a second track on top", "the best called the worst", "arguments hidden"),
+    "an end cut off without a fault",
     *("another name", "a dataset added", "a note beside the data"),
     *("a note in the recordings", "README claims more"),
 }
@@ -788,6 +815,7 @@ EDITED = {
     "a close-up added": add_a_close_up,
     "a video called broken": (call_it_broken, "no such file"),
     "a video left out, the schedule blamed": (blame_the_schedule, "no such"),
+    "a video left out, a fault blamed": (blame_a_fault, "videos.* no such"),
     # What was chosen, and identity.
     "another schedule named": replaced("capped_cubic_video_schedule", "every:2"),
     "a scheduled video left out": choose_by_hand,
@@ -886,6 +914,16 @@ OTHERS = {
     ),
     "rewards doubled of an episode whose encoder was killed": (
         *(honest.encoder_killed, partial(double_rewards_of, episode=1), "reward"),
+    ),
+    "an end cut off without a fault": (honest.end_lost, leave_faults_out, ""),
+    "an end cut off, with a fault of another episode": (
+        *(honest.end_lost, blame_another_episode, ""),
+    ),
+    "rewards doubled before a fault": (
+        *(honest.end_lost, partial(double_rewards_of, episode=1), "reward"),
+    ),
+    "a state of an ulp before a fault": (
+        *(honest.end_lost, edit_a_state, "qpos|qvel|states"),
     ),
     "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
     "the best called the worst": (best, replaced("best:1", "worst:1"), ""),

@@ -18,6 +18,7 @@ QUICK = [
     (honest.suite, PASS, (), {}, {}),
     (honest.kept, PASS, (), {}, {}),
     (honest.killed, PARTLY, {"kill"}, {}, {}),
+    (honest.trajectory_lost, PARTLY, {"fault"}, {}, {}),
     (honest.tracker_away, PASS, (), {}, {}),
 ]
 THOROUGH = [
@@ -40,6 +41,8 @@ THOROUGH = [
     (honest.encoder_killed, PARTLY, BROKEN, {}, {}),
     (honest.encoder_killed, PARTLY, BROKEN, {}, STATS),
     (honest.frame_missing, PARTLY, BROKEN, {}, {}),
+    (honest.end_lost, PARTLY, {"fault"}, {}, {}),
+    (honest.end_written_late, PASS, (), {}, {}),
     (honest.unseeded, PARTLY, {"unseeded beginning"}, {}, {}),
     (honest.early, PARTLY, {"early reset"}, {}, {}),
     (honest.wrapped, PASS, (), {}, {}),

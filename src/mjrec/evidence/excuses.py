@@ -149,8 +149,11 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         fed=(Topic.VIDEOS,),
     ),
     **dict.fromkeys(
-        ("kill", "early reset", "exception", "fault"),
+        ("kill", "early reset", "exception"),
         _Rule(ExcuseKind.EVENT, "its end is believed", fed=(Topic.REWARDS,)),
+    ),
+    "fault": _Rule(
+        ExcuseKind.EVENT, "its end, or all of it, is believed", fed=(Topic.REWARDS,)
     ),
 }
 # Claims that can change the numbers of a step.

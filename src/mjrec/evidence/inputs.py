@@ -97,12 +97,14 @@ class EpisodeInputs:
         exception: the exception, if one cut the episode off.
         broken: for each live video that was cut short, the reason and the number of
             frames kept; keyed by the video's name without extension.
+        lost: if a fault ended its trajectory early, or left none, the fault's reason
+            and the number of missing steps (1 if it is unknown); otherwise None.
         has_trajectory: whether its trajectory was kept.
         is_chosen: whether its video was chosen.
         start_time: the stated start time.
         end_time: the stated end time.
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
-            episode. They are used only if actions were not kept.
+            episode. They are used only if actions were not kept or were lost.
         evaluation: its `seed` and `episode` in an evaluation; None outside evaluations.
         selection: its video's facts about the choice among an evaluation's episodes.
     """
@@ -121,6 +123,7 @@ class EpisodeInputs:
     cut: str | None = None
     exception: Mapping[str, Any] | None = None
     broken: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    lost: tuple[str, int] | None = None
     has_trajectory: bool = False
     is_chosen: bool = False
     start_time: float | None = None

@@ -166,7 +166,9 @@ class _Playing:
             self._warned = mujoco_warnings(self._recreated.environment)
             if episode.has_actions:
                 self._play(episode)
-            elif episode.cut is None or episode.steps:
+            if episode.lost is not None:
+                self._lose(episode, *episode.lost)
+            elif not episode.has_actions and (episode.cut is None or episode.steps):
                 self._believe(episode)
             self._cut_off(episode)
             self._say_failed()
@@ -345,6 +347,23 @@ class _Playing:
             if steps:
                 self._note(episode, "wrappers", f"{without} {claim.format(steps)}")
 
+    def _lose(self, episode: EpisodeInputs, reason: str, missing: int) -> None:
+        """Lose the end of a trajectory, or all of it, where the original run did."""
+        is_gone, steps = episode.arrays is None, episode.steps
+        error = _exception_kind("mjrec.errors.FileNotWritten")(reason)
+        self._monitor.recorder.lose_states(error, all_rows=is_gone)
+        of = f"{steps + missing}{' or more' if episode.cut else ''}"
+        lost = "was lost, with any video of it"
+        if not is_gone:
+            lost = f"ends after {steps} of {of} steps"
+        self._note(
+            episode,
+            "fault",
+            f"its trajectory {lost}; its length, return and end are believed; "
+            f"according to its author: {reason:.200}",
+        )
+        self._take_steps(episode, missing)
+
     def _believe(self, episode: EpisodeInputs) -> None:
         """Record an episode without its actions, from its length, return and end."""
         self._note(
@@ -352,12 +371,19 @@ class _Playing:
             "actions not kept",
             "its actions were not kept; its length, return and end are believed",
         )
-        if episode.steps > _MOST_BELIEVED_STEPS:
-            raise NotRecreated(f"an episode cannot have {episode.steps} steps")
+        self._take_steps(episode, max(1, episode.steps))
+
+    def _take_steps(self, episode: EpisodeInputs, steps: int) -> None:
+        """Count the last steps of an episode without taking them."""
+        if steps > _MOST_BELIEVED_STEPS:
+            raise NotRecreated(f"an episode cannot have {steps} steps")
         recorder, said = self._monitor.recorder, episode.believed
-        for left in range(max(1, episode.steps) - 1, -1, -1):
+        for left in range(steps - 1, -1, -1):
             recorder.before_step()
-            reward = 0.0 if left or said.get("reward") is None else said["reward"]
+            reward = 0.0
+            if left == 0 and said.get("reward") is not None:
+                # A sum of parts might be rounded differently.
+                recorder.stats_recorder.rewards, reward = 0.0, said["reward"]
             is_end = left == 0 and episode.cut is None
             last = {name: is_end and said.get(name) is True for name in _ENDS}
             recorder.step(reward, **last, success=None if left else said.get("success"))

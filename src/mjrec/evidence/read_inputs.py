@@ -251,7 +251,7 @@ def _episodes(
 ) -> Iterator[dict[str, Any]]:
     """Yield the values of each episode's `EpisodeInputs`."""
     broken, cuts = _broken(files), journal.of_episodes("cut")
-    irregular = journal.of_episodes("action")
+    irregular, faults = journal.of_episodes("action"), journal.of_episodes("fault")
     failed = {facts.get("episode_id"): facts for facts in journal.facts_of("failed")}
     is_wrapped = bool(facts_in(environment).get("wrappers"))
     for number in sorted({*journal.entries, *cuts}):
@@ -265,10 +265,12 @@ def _episodes(
                 arrays=arrays,
             )
         if (entry := journal.entries.get(number)) is not None:
-            known = {"steps": entry.length, **known, **_of_entry(entry)}
+            lost = _lost(known, faults.get(number, ()), entry.length)
+            known = {"steps": entry.length, **known, **_of_entry(entry), "lost": lost}
         elif number in cuts:
             cut = cuts[number][-1]
             known |= {
+                "lost": _lost(known, faults.get(number, ())),
                 "cut": str(cut.get("reason")),
                 "is_chosen": cut.get("chosen") is True,
             }
@@ -293,6 +295,27 @@ def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
             reason, frames = str(said.get("broken_reason")), said.get("frame_count", 0)
             found.setdefault(number, {})[video] = [reason, count(frames)]
     return found
+
+
+def _lost(
+    trajectory: Mapping[str, Any],
+    faults: Iterable[Mapping[str, Any]],
+    length: int | None = None,
+) -> list[Any] | None:
+    """Return an episode's `EpisodeInputs.lost`.
+
+    Args:
+        trajectory: what is known from its trajectory.
+        faults: the faults in the journal for this episode.
+        length: its number of steps; None if it was cut off.
+    """
+    steps, stated = trajectory.get("steps", 0), facts_in(trajectory.get("exception"))
+    missing = 1 if length is None else length - steps
+    for fault in faults:
+        is_its = not trajectory or stated.get("message") == fault.get("reason")
+        if fault.get("what") == "trajectory" and is_its and missing > 0:
+            return [str(fault.get("reason")), missing]
+    return None
 
 
 def _of_entry(entry: JournalEntry) -> dict[str, Any]:

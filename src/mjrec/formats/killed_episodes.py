@@ -50,6 +50,9 @@ def how_it_ended(
         }
     else:
         known |= CUT_BY_KILL
+        if "exception" in facts:
+            # The rows ended before the process did, because of a full disk.
+            known["reason"] = "exception"
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:

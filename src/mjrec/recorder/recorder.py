@@ -224,6 +224,12 @@ class Recorder:
         if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
+    def lose_states(self, error: Exception, *, all_rows: bool) -> None:
+        """Lose the rest of the running episode's states; see `StateRecorder.lose`."""
+        self.fast = None
+        if self._recording is not None and self._recording.states is not None:
+            self._recording.states.lose(error, all_rows=all_rows)
+
     def before_step(self, action: Any = UNKNOWN_ACTION) -> None:
         """Check that a step is allowed now, and note its action.
 

@@ -267,9 +267,24 @@ class StateRecorder:
             if self._span is not None:
                 self._span.end(facts)
         except FileNotWritten as error:
-            self._break(str(error))
+            # An episode's facts are only late. A clip would go on with a gap.
+            if self._span is None or self._what == "video":
+                self._break(str(error))
             if not self._run.tolerates(self._what, error):
                 raise
+
+    def lose(self, error: Exception, *, all_rows: bool = False) -> None:
+        """Record nothing from now on, because of an error.
+
+        Args:
+            error: the error.
+            all_rows: whether not even the reset's row was written.
+        """
+        self.early_end = ending(error)
+        if all_rows:
+            self._take_back()
+        # Now, because the process may end before the recording does.
+        self._break(str(error), exception=self.early_end["exception"])
 
     def drop(self) -> None:
         """Discard the rows, even after the recording has ended.
@@ -297,16 +312,15 @@ class StateRecorder:
         except PicturesDiffer as error:
             self.end_frames(str(error))
         except FileNotWritten as error:
-            self.early_end = ending(error)
-            self._break(str(error))
+            self.lose(error)
             if not self._run.tolerates(self._what, error):
                 raise
 
-    def _break(self, reason: str) -> None:
+    def _break(self, reason: str, **facts: Any) -> None:
         # The first error ended the frames.
         if self.broken_reason is None:
             self.broken_reason = reason
-            self.note(broken_reason=reason)
+            self.note(broken_reason=reason, **facts)
 
     def _new_fast_path(self, span: SpanWriter) -> FastPath | None:
         start, action = self._start, self._action
