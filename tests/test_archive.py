@@ -89,7 +89,7 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path):
         (["Manifest.json"], "the archive's manifest"),
         # In gym's order: pair by pair, and in each presence, doubles, names.
         (["a.mp4 -"], "the metadata of the video"),
-        (["b+c.mp4", "-"], "not a video's name"),
+        (["b+c.mp4", "-"], "not a video name"),
         (["-", "b+c.mp4"], "The video "),
         (["a.mp4", "other/a.mp4"], "'a.mp4' occurs twice (the second time as "),
         (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' occurs twice"),

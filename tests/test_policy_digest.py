@@ -74,7 +74,18 @@ def rings():
     return ring, inner
 
 
+class Lazy:
+    """Pickled with its `__dict__`, or as if it had none yet."""
+
+    def __init__(self, *state):
+        self.state = state
+
+    def __reduce__(self):
+        return Lazy, (), *self.state
+
+
 SAME = {
+    "objects whose __dict__ was read": (Lazy(), Lazy({})),
     "strings that are one object, or two": (["ab", "ab"], ["ab", "".join("ab")]),
     "sets that were filled in another order": ({8, 0}, {0, 8}),
     "objects in a circle": (rings(), rings()),

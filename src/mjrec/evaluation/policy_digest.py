@@ -85,11 +85,18 @@ def _parse(payload: bytes) -> list[_Node]:
             else:
                 first = len(stack) - len(needs) + (name in _CHANGES)
                 parts, stack = stack[first:], stack[:first]
+            if name == "BUILD" and _is_empty_dict(parts[0]):
+                # Some objects get their `__dict__` only when it is first read.
+                continue
             if name in _CHANGES:
                 stack[-1].parts.append(_Node(name, value, parts))
             elif name != "POP_MARK":
                 stack.append(_Node(name, value, parts))
     return [*stack, *calls]
+
+
+def _is_empty_dict(node: _Node) -> bool:
+    return node.opcode == "EMPTY_DICT" and not node.parts
 
 
 def _digest(
