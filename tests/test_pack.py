@@ -311,7 +311,7 @@ def test_nothing_need_be_stated(recorded, tmp_path):
     folder = packed_and_unpacked(recorded, tmp_path)
     root = entities_of(folder)["./"]
     assert root["name"] == "Recordings of InvertedPendulum-v5"
-    assert root["license"].startswith("No licence was stated")
+    assert root["license"].startswith("No license was stated")
     assert "author" not in root
     cited = yaml.safe_load((folder / "data/CITATION.cff").read_text())
     assert cited["authors"] == [{"name": "Not stated"}]
