@@ -211,6 +211,23 @@ def replace_in_second(run, old, new):
                 write_hdf5(reader, path)
 
 
+def of_the_second(*lies):
+    """Lie of one of two recordings only."""
+
+    def lie(run):
+        (second := run.directory.with_name("second")).mkdir()
+        for path in list(run.directory.iterdir()):
+            if ".0.v." in path.name:
+                path.rename(second / path.name)
+            elif ".model." in path.name:
+                shutil.copy(path, second)
+        both(*lies)(ForgedRun(second))
+        for path in list(second.iterdir()):
+            path.replace(run.directory / path.name)
+
+    return lie
+
+
 def double_rewards_cut_off(run):
     """Of an episode that is in no statistics, and has a video."""
     twice = 2 * float(run.content(0).rewards.sum())
@@ -224,7 +241,22 @@ def double_the_return(run):
 
 
 # What is no plain value is given to no reset, so that nothing is recreated.
-give_no_plain_option = methodcaller("say", 3, options={"note": "version 1.0"})
+NO_PLAIN_OPTION = {"note": "version 1.0"}
+give_no_plain_option = methodcaller("say", 3, options=NO_PLAIN_OPTION)
+
+
+def say_an_option(run, **options):
+    run.edit_journal(lambda lines: lines[0]["run"]["options"].update(options))
+
+
+def name_an_argument(run):
+    """That no version of the environment takes."""
+
+    def edit(facts):
+        if isinstance(facts.get("environment"), dict):
+            facts["environment"]["kwargs"]["no_such"] = 1
+
+    run.say_everywhere(edit)
 
 
 def swap_the_ending(run):
@@ -643,6 +675,14 @@ CLAIMS = {
 }
 
 
+# What no reader could play, with what is said of it.
+IMPOSSIBLE = {
+    "a rate": (partial(say_an_option, max_fps="nan"), "max_fps.*nan"),
+    "an exact rate": (partial(say_an_option, max_fps="1/0"), "max_fps.*1/0"),
+    "a camera": (partial(say_an_option, camera="no_such"), "different .*no_such"),
+    "an argument": (name_an_argument, "different .*no_such"),
+    "an option": (methodcaller("say", 1, options=NO_PLAIN_OPTION), "different .*reset"),
+}
 FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
 OF_NOTHING = ("environment", "1.0")
 
@@ -887,6 +927,15 @@ OTHERS = {
     "rewards doubled of an episode whose encoder was killed": (
         *(honest.encoder_killed, partial(double_rewards_of, episode=1), "reward"),
     ),
+    **{
+        f"rewards doubled of one of two recordings, with {what} that cannot be": (
+            *(honest.several, of_the_second(each(2, double_rewards_of), lie), line),
+        )
+        for what, (lie, line) in IMPOSSIBLE.items()
+    },
+    "an option that no reset can be given, of a killed recording": (
+        *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION), "of a reset"),
+    ),
     "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
     "the best called the worst": (best, replaced("best:1", "worst:1"), ""),
     "the worst of an evaluation called its best": (evaluated_and_swapped, None, ""),
@@ -915,6 +964,17 @@ BELIEVED = {
         *(honest.pendulum, show_one_as_two, "same episode"),
     ),
     "one recording shown as two": (honest.pendulum, copy_the_recording, "same"),
+    # The first lines say what the reader lacks.
+    "one of two recordings called of one's own environment": (
+        honest.several,
+        lambda run: replace_in_second(run, PENDULUM, "My-v0"),
+        "believed identity recording 0.v: it cannot be recreated: this would run code",
+    ),
+    "an argument that another Gymnasium may have, in one of two recordings": (
+        honest.several,
+        of_the_second(name_an_argument, CLAIMS["another Gymnasium"]),
+        "believed identity recording 0.v: .*no_such",
+    ),
     "closed whenever an episode goes wrong, and resumed": (
         *(close_and_go_on, None, "continues after them"),
     ),

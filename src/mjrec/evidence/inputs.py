@@ -141,6 +141,7 @@ class RecordingInputs:
             for other environments.
         environment: `framework`, `id`, `kwargs`, `wrappers`, `wrapper_arguments` and
             `max_episode_steps`; None if they are not in the journal.
+        is_elsewhere: whether the journal claims other versions than those here.
         options: the recorder's options that are not the default; see `OPTIONS`.
         schedule: the name of the schedule.
         rule: the name of the `keep` rule, or None.
@@ -166,6 +167,7 @@ class RecordingInputs:
     infix: str
     env_id: str
     environment: Mapping[str, Any] | None
+    is_elsewhere: bool = False
     sources: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None

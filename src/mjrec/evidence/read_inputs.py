@@ -6,6 +6,7 @@ This runs in a sandbox, because it parses journals and HDF5 files.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -31,6 +32,7 @@ from ..formats.trajectory_hdf5 import open_hdf5
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from ..recorder.options import LIVE
+from ..rendering.recorded_facts import asked_rate
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.run import EVALUATION
 from .inputs import OPTIONS, Inputs, RecordingInputs, count
@@ -58,6 +60,7 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 # The keys of a choice among an evaluation's episodes, in a video's facts and a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
+_RATES = ("fps", "max_fps")
 _FAULT = ("episode_id", "what", "reason")
 # The facts of a trajectory that are inputs of its episode.
 _FACTS = (
@@ -145,6 +148,7 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
             "infix": files.infix,
             "env_id": str(facts_in(run.get("env_info")).get("env_id", "")),
             "environment": environment,
+            "is_elsewhere": run.get("versions") != dict(versions()),
             "sources": _sources(files, environment),
             "options": _options(run.get("options")),
             "rule": facts_in(run.get("keep")).get("rule"),
@@ -394,6 +398,13 @@ def _options(said: Any) -> dict[str, Any]:
     if not isinstance(said, Mapping):
         return {}
     for name, value in said.items():
-        if name not in OPTIONS or type(value) not in OPTIONS[name]:
+        is_known = name in OPTIONS and type(value) in OPTIONS[name]
+        if not is_known or (name in _RATES and not _is_rate(value)):
             raise ValueError(f"the option {name!r:.80} must not be {value!r:.80}")
     return dict(said)
+
+
+def _is_rate(value: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool(asked_rate(value))
+    return False
