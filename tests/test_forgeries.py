@@ -557,6 +557,13 @@ def add_a_line(run):
     run.edit_journal(lambda lines: lines.insert(-1, {"remark": {"success": True}}))
 
 
+def add_a_fault(run):
+    """Which would be in the first lines."""
+    fault = {"episode_id": None, "what": "result", "reason": "All goals were reached"}
+    run.edit_journal(lambda lines: lines.insert(1, {"fault": fault}))
+    run.edit_details(faults=[fault])
+
+
 def add_to_a_line(run):
     run.say(1)
 
@@ -865,6 +872,7 @@ EDITED = {
     "a key of the provenance": (add_to_facts("provenance"), "success_rate"),
     "a key of the machine": (add_to_facts("machine"), "success_rate"),
     "a line in the journal": (add_a_line, "remark"),
+    "a fault that no recorder has": (add_a_fault, "fault of 'result'"),
     "a key in a line of the journal": (add_to_a_line, "judged"),
 }
 

@@ -10,7 +10,7 @@ import contextlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from numpy.typing import NDArray
 
@@ -31,6 +31,7 @@ from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..machine import machine_fingerprint
 from ..provenance import versions
+from ..recorder.monitored_run import What
 from ..recorder.options import LIVE
 from ..rendering.recorded_facts import asked_rate
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -231,7 +232,9 @@ def _events(journal: _Journal) -> dict[str, Any]:
                 found["evaluation_keeps"].append(_known(known, _EVALUATION_KEEP))
             case "keep", {"recorded": list(numbers)}:
                 found["kept"] = [*map(count, numbers)]
-            case "fault", {"episode_id": int() | None, "what": str(), "reason": str()}:
+            case "fault", {"episode_id": int() | None, "what": what, "reason": str()}:
+                if what not in get_args(What):
+                    raise ValueError(f"no recorder has a fault of {what!r:.80}")
                 found["faults"].append([before, _known(facts, _FAULT)])
             case "recovered", _:
                 found["was_killed"] = True
