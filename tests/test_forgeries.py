@@ -728,6 +728,17 @@ def close_and_go_on(directory):
                     monitor.step(np.full(1, 0.1, np.float32))
 
 
+def played_again(directory):
+    """Twice two episodes that differ only in a seed or in actions of no effect."""
+    options = {"uid": "u", "mode": "evaluation", "workers": 1, "video_callable": False}
+    env = gymnasium.make(PENDULUM, max_episode_steps=3, reset_noise_scale=0.0)
+    with mjrec.Monitor(env, directory, **options) as monitor:
+        for seed, action in enumerate((0.0, -0.0, 4.0, 5.0)):
+            monitor.reset(seed=seed)
+            for _ in range(3):
+                monitor.step(np.full(1, action, np.float32))
+
+
 def by_hand(directory):
     honest.pendulum(directory, video_callable=lambda episode: episode in (0, 1))
 
@@ -970,6 +981,10 @@ BELIEVED = {
     ),
     "one episode shown as two, with its seed": (
         *(honest.pendulum, show_one_as_two, "same episode"),
+    ),
+    "one episode played as two": (
+        *(played_again, None),
+        r"same .*0 of 0.u, episode 1 of 0.u;(.|\n)*same .*2 of 0.u, episode 3 of 0.u;",
     ),
     "one recording shown as two": (honest.pendulum, copy_the_recording, "same"),
     # The first lines say what the reader lacks.

@@ -86,6 +86,8 @@ class EpisodeInputs:
             MuJoCo version or machine: each step then starts from the recorded state
             before it, so that differences in the last bits do not grow. `<name>.<part>`
             are the parts of `RecordedSteps` if the environment has wrappers.
+        played: a digest of its recorded positions, velocities and rewards; None if it
+            has no states. It is used only to find equal episodes.
         has_actions: whether the actions were kept, in the array or as irregular values.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of the arrays in a dictionary action; None if
@@ -114,6 +116,7 @@ class EpisodeInputs:
     random_state: Any = None
     steps: int = 0
     arrays: str | None = None
+    played: str | None = None
     has_actions: bool = False
     action_dtypes: Sequence[tuple[Count, Dtype]] = ()
     action_parts: Sequence[tuple[str, Sequence[Count]]] | None = None

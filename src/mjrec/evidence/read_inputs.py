@@ -7,6 +7,7 @@ This runs in a sandbox, because it parses journals and HDF5 files.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -45,6 +46,8 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
+# Rows of states to read at once.
+_ROWS = 10_000
 # The keys of the journal's events about episodes of an evaluation.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
@@ -331,16 +334,36 @@ def _of_trajectory(
                 arrays[f"{name}.states"] = reader.read("state", 0, reader.row_count)
         for part, values in _steps_taken(reader) if is_wrapped else ():
             arrays[f"{name}.{part}"] = values
+        played = _played(reader)
     return {
         **_known(facts, _FACTS),
         "steps": steps,
         "arrays": name,
+        "played": played,
         # If no action fits into an array, all actions are in the journal.
         "has_actions": name in arrays or len(irregular) == steps,
         "irregular": irregular,
         "selection": _selection(facts.get("video")),
         "has_trajectory": facts.get("kept") is not False,
     }
+
+
+def _played(reader: TrajectoryReader) -> str | None:
+    """Return the `EpisodeInputs.played` of a trajectory."""
+    names = getattr(reader.kind("state"), "names", None) or ()
+    if "qpos" not in names:
+        return None
+    digest = hashlib.sha256(_unsigned(reader.rewards))
+    for start in range(0, reader.row_count, _ROWS):
+        rows = reader.read("state", start, min(start + _ROWS, reader.row_count))
+        for part in (each for each in ("qpos", "qvel") if each in names):
+            digest.update(_unsigned(rows[part]))
+    return digest.hexdigest()
+
+
+def _unsigned(values: NDArray[Any]) -> bytes:
+    """Return the bytes of numbers without the signs of zeros."""
+    return bytes((values + 0.0).tobytes())
 
 
 def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
