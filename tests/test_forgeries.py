@@ -816,6 +816,10 @@ EDITED = {
         both(each(2, change_pixel), claim_ffmpeg),
         "hash",
     ),
+    "a frame rate 3 percent off, as the metadata says": (
+        methodcaller("film", 1, fps="97/4", playback_speed=0.97),
+        "fps",
+    ),
     "the fall not shown": (hide_the_fall, "frames"),
     "a frame doubled": (double_a_frame, "frames"),
     "a frame replaced": (refilm(lambda f: [*f[:2], f[1], *f[3:]]), "frame 2"),
