@@ -45,6 +45,13 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
 }
 
 
+# Inputs that change nothing but videos.
+_OF_VIDEOS: Final = frozenset(
+    (
+        *("render_mode", "width", "height", "camera", "own_camera", "fps", "max_fps"),
+        *("quality", "render", "annotate", "tiled"),
+    )
+)
 _DTYPES: Final = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -272,14 +279,16 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     of_author = ", the author's own model (MJCF)"
     is_mjcf = environment.get("framework") == "mjcf"
     yield "environment", f"{environment.get('id')}{of_author if is_mjcf else ''}"
+    unused = frozenset() if _may_have_videos(recording) else _OF_VIDEOS
     for name, value in (environment.get("kwargs") or {}).items():
-        yield f"environment: {name}", value
+        if name not in unused:
+            yield f"environment: {name}", value
     if environment.get("max_episode_steps"):
         yield "max_episode_steps", environment["max_episode_steps"]
     if environment.get("wrappers"):
         yield "wrappers", shown_wrappers(environment)
     for name, value in recording.options.items():
-        if value is not None:
+        if value is not None and name not in unused:
             yield name, value
     if recording.schedule not in (None, "capped_cubic_video_schedule"):
         yield "schedule", recording.schedule
@@ -291,6 +300,12 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     if resets:
         different = dict.fromkeys(map(json_text.dumps, resets))
         yield "options of resets", list(map(json_text.loads, different))
+
+
+def _may_have_videos(recording: RecordingInputs) -> bool:
+    chosen = recording.rule, recording.options.get("step_trigger")
+    is_kept = bool(recording.evaluation_keeps) or any(chosen)
+    return is_kept or recording.schedule != "disable_videos"
 
 
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:
