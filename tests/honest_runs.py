@@ -71,6 +71,11 @@ def cheetah(directory, **options):
     play(monitor, 3, seed=lambda episode: None if episode else 7)
 
 
+def large(directory):
+    """Record videos that are most of an archive."""
+    play(_monitored(_made(_CHEETAH, 4, height=480, width=640), directory), 2)
+
+
 def suite(directory):
     """Record a task of dm_control's suite."""
     tasks = pytest.importorskip("dm_control.suite")

@@ -211,6 +211,23 @@ def replace_in_second(run, old, new):
                 write_hdf5(reader, path)
 
 
+def of_the_second(*lies):
+    """Lie of one of two recordings only."""
+
+    def lie(run):
+        (second := run.directory.with_name("second")).mkdir()
+        for path in list(run.directory.iterdir()):
+            if ".0.v." in path.name:
+                path.rename(second / path.name)
+            elif ".model." in path.name:
+                shutil.copy(path, second)
+        both(*lies)(ForgedRun(second))
+        for path in list(second.iterdir()):
+            path.replace(run.directory / path.name)
+
+    return lie
+
+
 def double_rewards_cut_off(run):
     """Of an episode that is in no statistics, and has a video."""
     twice = 2 * float(run.content(0).rewards.sum())
@@ -224,7 +241,22 @@ def double_the_return(run):
 
 
 # What is no plain value is given to no reset, so that nothing is recreated.
-give_no_plain_option = methodcaller("say", 3, options={"note": "version 1.0"})
+NO_PLAIN_OPTION = {"note": "version 1.0"}
+give_no_plain_option = methodcaller("say", 3, options=NO_PLAIN_OPTION)
+
+
+def say_an_option(run, **options):
+    run.edit_journal(lambda lines: lines[0]["run"]["options"].update(options))
+
+
+def name_an_argument(run):
+    """That no version of the environment takes."""
+
+    def edit(facts):
+        if isinstance(facts.get("environment"), dict):
+            facts["environment"]["kwargs"]["no_such"] = 1
+
+    run.say_everywhere(edit)
 
 
 def swap_the_ending(run):
@@ -551,6 +583,13 @@ def add_a_line(run):
     run.edit_journal(lambda lines: lines.insert(-1, {"remark": {"success": True}}))
 
 
+def add_a_fault(run):
+    """Which would be in the first lines."""
+    fault = {"episode_id": None, "what": "result", "reason": "All goals were reached"}
+    run.edit_journal(lambda lines: lines.insert(1, {"fault": fault}))
+    run.edit_details(faults=[fault])
+
+
 def add_to_a_line(run):
     run.say(1)
 
@@ -669,6 +708,14 @@ CLAIMS = {
 }
 
 
+# What no reader could play, with what is said of it.
+IMPOSSIBLE = {
+    "a rate": (partial(say_an_option, max_fps="nan"), "max_fps.*nan"),
+    "an exact rate": (partial(say_an_option, max_fps="1/0"), "max_fps.*1/0"),
+    "a camera": (partial(say_an_option, camera="no_such"), "different .*no_such"),
+    "an argument": (name_an_argument, "different .*no_such"),
+    "an option": (methodcaller("say", 1, options=NO_PLAIN_OPTION), "different .*reset"),
+}
 FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
 OF_NOTHING = ("environment", "1.0")
 
@@ -705,6 +752,17 @@ def close_and_go_on(directory):
                 monitor.reset(seed=episode)
                 for _ in range(steps):
                     monitor.step(np.full(1, 0.1, np.float32))
+
+
+def played_again(directory):
+    """Twice two episodes that differ only in a seed or in actions of no effect."""
+    options = {"uid": "u", "mode": "evaluation", "workers": 1, "video_callable": False}
+    env = gymnasium.make(PENDULUM, max_episode_steps=3, reset_noise_scale=0.0)
+    with mjrec.Monitor(env, directory, **options) as monitor:
+        for seed, action in enumerate((0.0, -0.0, 4.0, 5.0)):
+            monitor.reset(seed=seed)
+            for _ in range(3):
+                monitor.step(np.full(1, action, np.float32))
 
 
 def by_hand(directory):
@@ -785,6 +843,10 @@ EDITED = {
         both(each(2, change_pixel), claim_ffmpeg),
         "hash",
     ),
+    "a frame rate 3 percent off, as the metadata says": (
+        methodcaller("film", 1, fps="97/4", playback_speed=0.97),
+        "fps",
+    ),
     "the fall not shown": (hide_the_fall, "frames"),
     "a frame doubled": (double_a_frame, "frames"),
     "a frame replaced": (refilm(lambda f: [*f[:2], f[1], *f[3:]]), "frame 2"),
@@ -853,6 +915,7 @@ EDITED = {
     "a key of the provenance": (add_to_facts("provenance"), "success_rate"),
     "a key of the machine": (add_to_facts("machine"), "success_rate"),
     "a line in the journal": (add_a_line, "remark"),
+    "a fault that no recorder has": (add_a_fault, "fault of 'result'"),
     "a key in a line of the journal": (add_to_a_line, "judged"),
 }
 
@@ -925,6 +988,15 @@ OTHERS = {
     "a state of an ulp before a fault": (
         *(honest.end_lost, edit_a_state, "qpos|qvel|states"),
     ),
+    **{
+        f"rewards doubled of one of two recordings, with {what} that cannot be": (
+            *(honest.several, of_the_second(each(2, double_rewards_of), lie), line),
+        )
+        for what, (lie, line) in IMPOSSIBLE.items()
+    },
+    "an option that no reset can be given, of a killed recording": (
+        *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION), "of a reset"),
+    ),
     "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
     "the best called the worst": (best, replaced("best:1", "worst:1"), ""),
     "the worst of an evaluation called its best": (evaluated_and_swapped, None, ""),
@@ -952,7 +1024,22 @@ BELIEVED = {
     "one episode shown as two, with its seed": (
         *(honest.pendulum, show_one_as_two, "same episode"),
     ),
+    "one episode played as two": (
+        *(played_again, None),
+        r"same .*0 of 0.u, episode 1 of 0.u;(.|\n)*same .*2 of 0.u, episode 3 of 0.u;",
+    ),
     "one recording shown as two": (honest.pendulum, copy_the_recording, "same"),
+    # The first lines say what the reader lacks.
+    "one of two recordings called of one's own environment": (
+        honest.several,
+        lambda run: replace_in_second(run, PENDULUM, "My-v0"),
+        "believed identity recording 0.v: it cannot be recreated: this would run code",
+    ),
+    "an argument that another Gymnasium may have, in one of two recordings": (
+        honest.several,
+        of_the_second(name_an_argument, CLAIMS["another Gymnasium"]),
+        "believed identity recording 0.v: .*no_such",
+    ),
     "closed whenever an episode goes wrong, and resumed": (
         *(close_and_go_on, None, "continues after them"),
     ),

@@ -106,7 +106,8 @@ HOPPER = {"id": "Hopper-v5"}
             BELIEVED,
             "3, 4",
         ),
-        # Other actions, or another beginning, are another episode.
+        # Other actions, or another beginning, are another episode if nothing is known
+        # of their states.
         (
             [
                 recording(0, episode(0, seed=1, arrays="a"), episode(1, arrays="a2")),
@@ -114,6 +115,16 @@ HOPPER = {"id": "Hopper-v5"}
             ],
             BELIEVED,
             "episode 0 of 0.1, episode 0 of 1.1",
+        ),
+        # Other actions that lead to the same states are not.
+        (
+            [
+                recording(0, episode(0, seed=1, arrays="a", played="x")),
+                recording(1, episode(0, seed=2, arrays="b", played="x")),
+                recording(2, episode(0, seed=1, arrays="c", played="y")),
+            ],
+            BELIEVED,
+            "episode 0 of 0.1, episode 0 of 1.1;",
         ),
         # All files bear the name, and another environment was run.
         ([recording(0, episode(0), env_id="ours", environment=HOPPER)], BELIEVED, ""),

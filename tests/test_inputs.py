@@ -108,6 +108,29 @@ def test_unusual_inputs_are_listed(data):
     assert recording["environment"] == "InvertedPendulum-v5"
 
 
+@pytest.mark.parametrize(
+    ("schedule", "rule"),
+    [("disable_videos", None), ("disable_videos", "best:1"), ("record_all", None)],
+)
+def test_the_view_is_listed_if_there_may_be_videos(schedule, rule):
+    """Without any, it changed nothing."""
+    kwargs = {"render_mode": "rgb_array", "width": 32, "frame_skip": 3}
+    environment = {"id": "A-v0", "framework": "gymnasium", "kwargs": kwargs}
+    recording = RecordingInputs(
+        infix="0.u",
+        env_id="A-v0",
+        environment=environment,
+        options={"camera": "track", "observations": True},
+        schedule=schedule,
+        rule=rule,
+    )
+    [said] = Inputs(recordings=[recording]).unusual().values()
+    assert {"environment: frame_skip", "observations"} <= said.keys()
+    view = {"environment: render_mode", "environment: width", "camera"}
+    is_listed = (schedule, rule) != ("disable_videos", None)
+    assert view & said.keys() == (view if is_listed else set())
+
+
 def test_wrappers_are_listed_with_their_arguments():
     """Gymnasium's own can give any reward."""
     environment = {

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from packed_runs import make_bag_fit, the, unpacked
 from parts import parametrize
@@ -307,6 +308,8 @@ def test_model_that_includes_files_from_outside_is_not_compiled(tmp_path):
         ({"level": "all"}, mjrec.UnknownName),
         ({"sample": 0}, mjrec.InvalidArgument),
         ({"sample": True}, mjrec.InvalidArgument),
+        ({"sample": np.True_}, mjrec.InvalidArgument),
+        ({"sample": np.int64(1)}, mjrec.UnreadableArchive),
         ({"allow": ["anything"]}, mjrec.InvalidArgument),
         ({"report": "/nowhere/at/all.html"}, mjrec.DirectoryNotWritable),
         ({}, mjrec.UnreadableArchive),

@@ -60,10 +60,11 @@ class NotRecreated(Exception):
 
     Args:
         reason: the clause.
-        excuse: the component that the reader lacks: "environment" or "wrappers".
+        excuse: the component that the reader lacks: "environment" or "wrappers"; None
+            if the inputs are impossible for any reader.
     """
 
-    def __init__(self, reason: str, *, excuse: str = "environment") -> None:
+    def __init__(self, reason: str, *, excuse: str | None = None) -> None:
         super().__init__(reason)
         self.excuse = excuse
 
@@ -172,6 +173,7 @@ def recreate(
     own_camera: int | str | None = None,
     trust: frozenset[str] = frozenset(),
     mjcf: tuple[Path, Any] | None = None,
+    is_elsewhere: bool = False,
 ) -> Recreated:
     """Recreate the environment of a recording.
 
@@ -181,6 +183,7 @@ def recreate(
         trust: additional ids that the reader trusts, `Id` or `module:Id`. The module
             must come from the reader, never from the recording.
         mjcf: the author's MJCF file and its model, for an environment made from a file.
+        is_elsewhere: whether the recording claims other versions than those here.
 
     Raises:
         NotRecreated: the environment is not trusted, or cannot be created here.
@@ -195,18 +198,23 @@ def recreate(
         )
     if not isinstance(kwargs, Mapping | None):
         raise NotRecreated(f"its arguments are invalid: {kwargs!r:.100}")
-    match recorded.get("framework"):
-        case "gymnasium":
-            env = _gymnasium(env_id, kwargs, limit, trust)
-        case "dm_control":
-            if recorded.get("wrappers"):
-                raise _wrappers_refused(recorded["wrappers"])
-            return _dm_control(env_id, kwargs, limit)
-        case "mjcf" if mjcf is not None:
-            env = _mjcf(*mjcf, kwargs or {}, limit)
-        case _:
-            raise NotRecreated("its model's sources are not in the archive")
-    with _failures(env_id):
+    trusted = {each.rpartition(":")[2]: each for each in trust}.get(env_id)
+    # The author's version may take arguments that the reader's does not.
+    is_other = is_elsewhere or trusted is not None
+    with _failures(env_id, excuse="environment" if is_other else None):
+        match recorded.get("framework"):
+            case "gymnasium":
+                env = _gymnasium(env_id, kwargs, limit, trusted)
+            case "dm_control":
+                if recorded.get("wrappers"):
+                    raise _wrappers_refused(recorded["wrappers"])
+                return _dm_control(env_id, kwargs, limit)
+            case "mjcf" if mjcf is not None:
+                env = _mjcf(*mjcf, kwargs or {}, limit)
+            case "mjcf":
+                raise _lacking("its model's sources are not in the archive")
+            case framework:
+                raise NotRecreated(f"its framework, {framework!r:.80}, does not exist")
         if own_camera is not None:
             set_own_camera(env, own_camera)
         return _wrapped(env, recorded)
@@ -231,36 +239,31 @@ def _gymnasium(
     env_id: str,
     kwargs: Mapping[str, Any] | None,
     limit: int | None,
-    trust: frozenset[str],
+    trusted: str | None,
 ) -> gymnasium.Env[Any, Any]:
-    trusted = {each.rpartition(":")[2]: each for each in trust}.get(env_id)
     entry_point = _entry_point(env_id)
     if trusted is None and not any(_is_below(entry_point, each) for each in _TRUSTED):
-        raise NotRecreated(
+        raise _lacking(
             f"this would run code from the archive: {env_id!r:.100} is not one of the "
             "environments of Gymnasium, Gymnasium-Robotics or dm_control that are "
             f"installed here. If you trust it, use --trust {env_id:.100}"
         )
     if kwargs is None:
-        raise NotRecreated(
-            "it was created with arguments that a recording cannot store, so it cannot "
-            "be recreated"
-        )
+        raise _lacking("it was created with arguments that a recording cannot store")
     for name, value in kwargs.items():
         is_shown = name != "render_mode" or value in _RENDER_MODES
         if name in _MAKE or not is_shown or not _is_plain_item(name, value):
-            raise NotRecreated(
+            raise _lacking(
                 f"its argument {name!r:.80} ({value!r:.80}) is not a plain "
                 "value within bounds, or names a file"
             )
-    with _failures(env_id):
-        return gymnasium.make(
-            trusted or env_id,
-            # gymnasium.make's value for no limit.
-            max_episode_steps=-1 if limit is None else limit,
-            disable_env_checker=True,
-            **kwargs,
-        )
+    return gymnasium.make(
+        trusted or env_id,
+        # gymnasium.make's value for no limit.
+        max_episode_steps=-1 if limit is None else limit,
+        disable_env_checker=True,
+        **kwargs,
+    )
 
 
 def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
@@ -305,38 +308,36 @@ def _mjcf(
     # Not imported at the top, because it loads MuJoCo.
     from .mjcf_environments import MjcfEnvironment
 
-    with _failures(path.stem):
-        size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
-        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
-        return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
+    size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
+    env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
+    return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
 
 
 def _dm_control(
     env_id: str, kwargs: Mapping[str, Any] | None, limit: int | None
 ) -> Recreated:
     if not _is_in_suite(env_id):
-        raise NotRecreated(
+        raise _lacking(
             f"{env_id!r:.100} is not a task of the installed dm_control suite, or "
             'dm_control does not work here: pip install "mjrec[dm-control]"'
         )
     for key, value in (kwargs or {}).items():
         parts = value if isinstance(value, Mapping) else {key: value}
         if key not in _SUITE_ARGUMENTS or not _are_plain(parts):
-            raise NotRecreated(
+            raise _lacking(
                 f"its argument {key!r:.80} ({value!r:.80}) is not a plain value "
                 "within bounds"
             )
     from .dm_control_environments import load_task
 
-    with _failures(env_id):
-        task_kwargs = (kwargs or {}).get("task_kwargs") or {}
-        if env_id.startswith("dm_control/lqr-") and "random" not in task_kwargs:
-            raise NotRecreated(
-                f"{env_id} chooses its model at random when it is created, and the "
-                "seed for this is not recorded"
-            )
-        env = load_task(env_id, kwargs, limit=limit)
-        return Recreated(environment=env, is_dm_env=True)
+    task_kwargs = (kwargs or {}).get("task_kwargs") or {}
+    if env_id.startswith("dm_control/lqr-") and "random" not in task_kwargs:
+        raise _lacking(
+            f"{env_id} chooses its model at random when it is created, and the "
+            "seed for this is not recorded"
+        )
+    env = load_task(env_id, kwargs, limit=limit)
+    return Recreated(environment=env, is_dm_env=True)
 
 
 def _are_plain(arguments: Mapping[str, Any]) -> bool:
@@ -397,7 +398,7 @@ def _is_in_suite(env_id: str) -> bool:
 
 
 @contextlib.contextmanager
-def _failures(what: str) -> Iterator[None]:
+def _failures(what: str, *, excuse: str | None) -> Iterator[None]:
     """Convert any exception in an environment's own code to `NotRecreated`."""
     try:
         yield
@@ -405,5 +406,10 @@ def _failures(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise NotRecreated(
-            f"{what:.100} failed here: {type(error).__name__}: {error!s:.300}"
+            f"{what:.100} failed here: {type(error).__name__}: {error!s:.300}",
+            excuse=excuse,
         ) from error
+
+
+def _lacking(reason: str) -> NotRecreated:
+    return NotRecreated(reason, excuse="environment")

@@ -219,20 +219,33 @@ def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Fi
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:
-            if not each.has_actions or not each.steps:
+            if not each.steps:
                 continue
-            what = [recording.env_id, each.seed, each.irregular]
-            if each.seed is None:
-                what += [each.random_state, _digest(arrays.get(f"{each.arrays}.state"))]
-            what.append(_digest(arrays.get(each.arrays or "")))
-            found.setdefault(json_text.dumps(what), []).append(recording.item(each))
-    for items in found.values():
+            for what in _contents(each, arrays):
+                key = json_text.dumps([recording.env_id, *what])
+                found.setdefault(key, []).append(recording.item(each))
+    # Episodes may be equal in both their states and their actions.
+    for items in dict.fromkeys(map(tuple, found.values())):
         if len(items) > 1:
             reason = (
-                "the same episode, with the same initial state and actions: "
+                "the same episode, with the same states or the same seed and actions: "
                 f"{listed(sorted(items), _MOST_SHOWN)}; it counts once"
             )
             yield _headline(items[0], reason, Outcome.BELIEVED, len(items) - 1)
+
+
+def _contents(
+    episode: EpisodeInputs, arrays: Mapping[str, NDArray[Any]]
+) -> Iterator[list[Any]]:
+    """Yield what two equal episodes have in common: what was played, and why."""
+    if episode.played is not None:
+        yield [episode.played]
+    if episode.has_actions:
+        what = [episode.seed, episode.irregular]
+        if episode.seed is None:
+            state = _digest(arrays.get(f"{episode.arrays}.state"))
+            what += [episode.random_state, state]
+        yield [*what, _digest(arrays.get(episode.arrays or ""))]
 
 
 def _digest(array: NDArray[Any] | None) -> str:

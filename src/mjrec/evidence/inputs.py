@@ -45,6 +45,13 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
 }
 
 
+# Inputs that change nothing but videos.
+_OF_VIDEOS: Final = frozenset(
+    (
+        *("render_mode", "width", "height", "camera", "own_camera", "fps", "max_fps"),
+        *("quality", "render", "annotate", "tiled"),
+    )
+)
 _DTYPES: Final = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -86,6 +93,8 @@ class EpisodeInputs:
             MuJoCo version or machine: each step then starts from the recorded state
             before it, so that differences in the last bits do not grow. `<name>.<part>`
             are the parts of `RecordedSteps` if the environment has wrappers.
+        played: a digest of its recorded positions, velocities and rewards; None if it
+            has no states. It is used only to find equal episodes.
         has_actions: whether the actions were kept, in the array or as irregular values.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of the arrays in a dictionary action; None if
@@ -116,6 +125,7 @@ class EpisodeInputs:
     random_state: Any = None
     steps: int = 0
     arrays: str | None = None
+    played: str | None = None
     has_actions: bool = False
     action_dtypes: Sequence[tuple[Count, Dtype]] = ()
     action_parts: Sequence[tuple[str, Sequence[Count]]] | None = None
@@ -144,6 +154,7 @@ class RecordingInputs:
             for other environments.
         environment: `framework`, `id`, `kwargs`, `wrappers`, `wrapper_arguments` and
             `max_episode_steps`; None if they are not in the journal.
+        is_elsewhere: whether the journal claims other versions than those here.
         options: the recorder's options that are not the default; see `OPTIONS`.
         schedule: the name of the schedule.
         rule: the name of the `keep` rule, or None.
@@ -169,6 +180,7 @@ class RecordingInputs:
     infix: str
     env_id: str
     environment: Mapping[str, Any] | None
+    is_elsewhere: bool = False
     sources: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None
@@ -270,14 +282,16 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     of_author = ", the author's own model (MJCF)"
     is_mjcf = environment.get("framework") == "mjcf"
     yield "environment", f"{environment.get('id')}{of_author if is_mjcf else ''}"
+    unused = frozenset() if _may_have_videos(recording) else _OF_VIDEOS
     for name, value in (environment.get("kwargs") or {}).items():
-        yield f"environment: {name}", value
+        if name not in unused:
+            yield f"environment: {name}", value
     if environment.get("max_episode_steps"):
         yield "max_episode_steps", environment["max_episode_steps"]
     if environment.get("wrappers"):
         yield "wrappers", shown_wrappers(environment)
     for name, value in recording.options.items():
-        if value is not None:
+        if value is not None and name not in unused:
             yield name, value
     if recording.schedule not in (None, "capped_cubic_video_schedule"):
         yield "schedule", recording.schedule
@@ -289,6 +303,12 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     if resets:
         different = dict.fromkeys(map(json_text.dumps, resets))
         yield "options of resets", list(map(json_text.loads, different))
+
+
+def _may_have_videos(recording: RecordingInputs) -> bool:
+    chosen = recording.rule, recording.options.get("step_trigger")
+    is_kept = bool(recording.evaluation_keeps) or any(chosen)
+    return is_kept or recording.schedule != "disable_videos"
 
 
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:

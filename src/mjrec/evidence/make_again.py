@@ -82,16 +82,19 @@ def play_recording(recording: RecordingInputs, making: Making) -> None:
         Error: the run could not be recorded.
     """
     if recording.environment is None:
-        raise NotRecreated("the journal does not name its environment")
+        reason = "the journal does not name its environment"
+        raise NotRecreated(reason, excuse="environment")
     directory = making.directory
-    mjcf = None
-    if recording.sources is not None:
-        mjcf = _unpack_sources(making.sources / recording.sources, directory.parent)
+    mjcf, is_elsewhere = None, recording.is_elsewhere
+    sources = making.sources / (recording.sources or "")
+    if sources.is_file():
+        mjcf = _unpack_sources(sources, directory.parent, is_elsewhere=is_elsewhere)
     recreated = recreate(
         recording.environment,
         own_camera=recording.options.get("own_camera"),
         trust=making.trust,
         mjcf=mjcf,
+        is_elsewhere=is_elsewhere,
     )
     if recreated.turns_by_rk4():
         reason = "MuJoCo 4.0 rotates free bodies differently with the integrator RK4"
@@ -100,16 +103,23 @@ def play_recording(recording: RecordingInputs, making: Making) -> None:
     if not recording.was_killed:
         _Playing(recording, recreated, making).run()
         return
+    refusal = directory.with_name(f"{recording.infix}.refusal")
     # A child process is killed in the same place, so that it leaves the same files.
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
-            _Playing(recording, recreated, making).run()
+            try:
+                _Playing(recording, recreated, making).run()
+            except NotRecreated as error:
+                refusal.write_text(json.dumps([str(error), error.excuse]))
         # Only reached if the replay failed: a successful one kills the process.
         os._exit(1)
     _, status = os.waitpid(child, 0)
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
-        raise NotRecreated("the killed recording could not be replayed")
+        reason, excuse = "the killed recording could not be replayed", None
+        if refusal.exists():
+            reason, excuse = json.loads(refusal.read_text())
+        raise NotRecreated(reason, excuse=excuse)
     making.notes[:] = read_notes(directory.parent)
     if not recording.has_sources:
         # A thread may have stored the sources just before the kill.
@@ -417,22 +427,25 @@ def _exception_kind(name: str) -> type[BaseException]:
     return type(qualified, (Exception,), {"__module__": module or "builtins"})
 
 
-def _unpack_sources(path: Path, into: Path) -> tuple[Path, Any]:
+def _unpack_sources(path: Path, into: Path, *, is_elsewhere: bool) -> tuple[Path, Any]:
     """Unpack an MJCF file and the files that it refers to; return its path and model.
 
     Args:
         path: the zip file that a recorder wrote.
         into: the folder to unpack into.
+        is_elsewhere: whether the recording claims other versions than those here.
 
     Raises:
-        NotRecreated: the zip file is missing, damaged or dangerous, or MuJoCo rejects
-            the model.
+        NotRecreated: the zip file is damaged or dangerous, or MuJoCo rejects the model.
     """
     try:
         # This checks all names in the zip file.
         model = read_authored(path)
     except (OSError, UnreadableFile) as error:
-        raise NotRecreated(f"its model cannot be compiled: {error}") from error
+        raise NotRecreated(
+            f"its model cannot be compiled: {error}",
+            excuse="environment" if is_elsewhere else None,
+        ) from error
     folder = into / path.stem
     with zipfile.ZipFile(path) as archive:
         main = json.loads(archive.read("contents.json"))["main"]

@@ -6,10 +6,12 @@ This runs in a sandbox, because it parses journals and HDF5 files.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from numpy.typing import NDArray
 
@@ -30,7 +32,9 @@ from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..machine import machine_fingerprint
 from ..provenance import versions
+from ..recorder.monitored_run import What
 from ..recorder.options import LIVE
+from ..rendering.recorded_facts import asked_rate
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.run import EVALUATION
 from .inputs import OPTIONS, Inputs, RecordingInputs, count
@@ -42,6 +46,8 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
+# Rows of states to read at once.
+_ROWS = 10_000
 # The keys of the journal's events about episodes of an evaluation.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
@@ -58,6 +64,7 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 # The keys of a choice among an evaluation's episodes, in a video's facts and a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
+_RATES = ("fps", "max_fps")
 _FAULT = ("episode_id", "what", "reason")
 # The facts of a trajectory that are inputs of its episode.
 _FACTS = (
@@ -145,6 +152,7 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
             "infix": files.infix,
             "env_id": str(facts_in(run.get("env_info")).get("env_id", "")),
             "environment": environment,
+            "is_elsewhere": run.get("versions") != dict(versions()),
             "sources": _sources(files, environment),
             "options": _options(run.get("options")),
             "rule": facts_in(run.get("keep")).get("rule"),
@@ -227,7 +235,9 @@ def _events(journal: _Journal) -> dict[str, Any]:
                 found["evaluation_keeps"].append(_known(known, _EVALUATION_KEEP))
             case "keep", {"recorded": list(numbers)}:
                 found["kept"] = [*map(count, numbers)]
-            case "fault", {"episode_id": int() | None, "what": str(), "reason": str()}:
+            case "fault", {"episode_id": int() | None, "what": what, "reason": str()}:
+                if what not in get_args(What):
+                    raise ValueError(f"no recorder has a fault of {what!r:.80}")
                 found["faults"].append([before, _known(facts, _FAULT)])
             case "recovered", _:
                 found["was_killed"] = True
@@ -347,16 +357,36 @@ def _of_trajectory(
                 arrays[f"{name}.states"] = reader.read("state", 0, reader.row_count)
         for part, values in _steps_taken(reader) if is_wrapped else ():
             arrays[f"{name}.{part}"] = values
+        played = _played(reader)
     return {
         **_known(facts, _FACTS),
         "steps": steps,
         "arrays": name,
+        "played": played,
         # If no action fits into an array, all actions are in the journal.
         "has_actions": name in arrays or len(irregular) == steps,
         "irregular": irregular,
         "selection": _selection(facts.get("video")),
         "has_trajectory": facts.get("kept") is not False,
     }
+
+
+def _played(reader: TrajectoryReader) -> str | None:
+    """Return the `EpisodeInputs.played` of a trajectory."""
+    names = getattr(reader.kind("state"), "names", None) or ()
+    if "qpos" not in names:
+        return None
+    digest = hashlib.sha256(_unsigned(reader.rewards))
+    for start in range(0, reader.row_count, _ROWS):
+        rows = reader.read("state", start, min(start + _ROWS, reader.row_count))
+        for part in (each for each in ("qpos", "qvel") if each in names):
+            digest.update(_unsigned(rows[part]))
+    return digest.hexdigest()
+
+
+def _unsigned(values: NDArray[Any]) -> bytes:
+    """Return the bytes of numbers without the signs of zeros."""
+    return bytes((values + 0.0).tobytes())
 
 
 def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
@@ -417,6 +447,13 @@ def _options(said: Any) -> dict[str, Any]:
     if not isinstance(said, Mapping):
         return {}
     for name, value in said.items():
-        if name not in OPTIONS or type(value) not in OPTIONS[name]:
+        is_known = name in OPTIONS and type(value) in OPTIONS[name]
+        if not is_known or (name in _RATES and not _is_rate(value)):
             raise ValueError(f"the option {name!r:.80} must not be {value!r:.80}")
     return dict(said)
+
+
+def _is_rate(value: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool(asked_rate(value))
+    return False

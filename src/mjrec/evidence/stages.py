@@ -24,7 +24,7 @@ from typing import Any, Final
 from ..errors import Error, FileNotWritten, UnreadableArchive
 from ..formats.json_fields import to_json
 from ..sandbox import enter
-from .findings import Finding, Level
+from .findings import Finding, Level, Outcome, Topic
 from .inputs import ARRAYS_FILE, Inputs
 from .layout import PAYLOAD, RECORDINGS, SAMPLED
 
@@ -160,9 +160,21 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                 for path in iter_monitor_files(played, hidden=True):
                     if infix_of(path.name) == recording.infix:
                         path.unlink()
-                episodes = max(1, len(recording.episodes))
+                name, episodes = recording.name, max(1, len(recording.episodes))
                 excuse, reason = error.excuse, str(error)
-                notes.append(note(recording.name, excuse, reason, count=episodes))
+                if excuse is not None:
+                    notes.append(note(name, excuse, reason, count=episodes))
+                lost = Finding(
+                    Topic.IDENTITY,
+                    name,
+                    Outcome.DIFFERENT if excuse is None else Outcome.BELIEVED,
+                    f"it cannot be recreated: {reason}",
+                    excuse=excuse,
+                    count=episodes,
+                    unit="episode",
+                    is_headline=True,
+                )
+                say(finding=to_json(lost))
     if any(recording.was_killed for recording in inputs.recordings):
         recover(played)
     choose_for_evaluations(inputs.recordings, played, notes)

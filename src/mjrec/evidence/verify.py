@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import numbers
 import operator
 import os
 import secrets
@@ -237,12 +238,13 @@ def _level(level: str) -> Level:
 def _sample(sample: int | None) -> int | None:
     if sample is None:
         return None
-    if isinstance(sample, bool) or operator.index(sample) < 1:
+    is_bool = isinstance(sample, bool)
+    if is_bool or not isinstance(sample, numbers.Integral) or sample < 1:
         raise InvalidArgument(
             "sample must be the number of frames to check in each video, 1 or more, "
             f"got {sample!r}. Omit it to check all of them."
         )
-    return operator.index(sample)
+    return int(sample)
 
 
 def _versions() -> Iterator[tuple[str, str]]:

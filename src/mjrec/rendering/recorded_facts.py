@@ -271,7 +271,12 @@ def _clock(reader: TrajectoryReader) -> NDArray[np.float64] | None:
     return np.concatenate(blocks)
 
 
-def _asked_rate(value: Any) -> Fraction:
+def asked_rate(value: Any) -> Fraction:
+    """Return a rate that a user requested, from its text in a recording.
+
+    Raises:
+        ValueError: the text is not a valid rate.
+    """
     if not _ASKED_RATE.fullmatch(text(value)):
         raise ValueError(f"{value!r:.80} is not a valid rate")
     try:
@@ -339,8 +344,8 @@ _FACTS: Mapping[str, Callable[[Any], Any]] = {
         recording=one_of("deferred", "live"),
         reason=optional(text),
         selection=optional(mapping),
-        fps=optional(_asked_rate),
-        max_fps=optional(_asked_rate),
+        fps=optional(asked_rate),
+        max_fps=optional(asked_rate),
         cameras=optional(_cameras),
         tiled=boolean,
         annotate=boolean,
