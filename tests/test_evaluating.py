@@ -670,6 +670,12 @@ def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path):
     assert newly.name in listed_in(tmp_path / "e")
 
 
+ROBOT = """
+<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".5"/></body>
+</worldbody><actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
 class Weighted:
     """A policy with a weight."""
 
@@ -700,6 +706,31 @@ def test_another_policy_is_not_gone_on_with(tmp_path, monkeypatch):
         DifferentEvaluation, match=r"\(its code\).*its argument weights\)"
     ):
         run(tmp_path / "named", **named, resume=True)
+
+
+def test_what_policy_and_file_refer_to_is_compared_too(tmp_path, monkeypatch):
+    """A module that the policy imports, and the model that an MJCF file compiles to."""
+    monkeypatch.chdir(tmp_path)
+    helper, robot = tmp_path / "own_gains.py", tmp_path / "robot.xml"
+    text = f"import {helper.stem}\ndef act(o):\n    return [{helper.stem}.GAIN]\n"
+    (tmp_path / "gain_policy.py").write_text(text)
+    helper.write_text("GAIN = 0.0\n")
+    robot.write_text(ROBOT)
+    options = {"tasks": ["robot.xml"], "policy": "gain_policy:act", "episodes": 1}
+    run(tmp_path / "e", **options, num_seeds=1)
+    helper.write_text("GAIN = 1.0\n")
+    robot.write_text(ROBOT.replace('"slide"', '"hinge"'))
+    # Where nothing is left to run, nothing can be mixed.
+    assert len(run(tmp_path / "e", **options, num_seeds=1, resume=True).results) == 1
+    with pytest.raises(DifferentEvaluation) as raised:
+        run(tmp_path / "e", **options, resume=True)
+    names = {"module own_gains", "model of robot.xml"}
+    assert {*raised.value.differences} == names
+    helper.write_text("GAIN = 0.0\n")
+    robot.write_text(f"<!-- the same -->{ROBOT}")
+    run(tmp_path / "e", **options, resume=True)
+    run(tmp_path / "whole", **options)
+    assert contents(tmp_path / "e") == contents(tmp_path / "whole")
 
 
 def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):

@@ -136,7 +136,9 @@ def evaluate(
         resume: continue the evaluation in the directory without rerunning finished
             episodes. Arguments that are None keep their earlier values. You may add
             tasks, seeds and (except with `"suite"`) episodes. Everything else must be
-            the same, including the policy's code and weights.
+            the same, including the policy's code and weights, the models of MJCF
+            files, and the modules that are imported when the environments and the
+            policy are created. Installed packages are not compared.
         force: delete the evaluation in the directory first.
         max_steps: truncate episodes after this many steps. None for the environment's
             limit, or 1000 steps if it has no limit.
@@ -222,16 +224,23 @@ def evaluate(
         # Quick checks run locally, so that they do not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
-            needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
+            names = [task.name for task in plan.tasks]
+            needed = len(names) * len(plan.chunks)
+            if begun is not None:
+                chunks = following.chunks_in(place, plan)
+                missing = [each.task.name for each in chunks if not each.is_complete]
+                names, needed = [*dict.fromkeys(missing)], len(missing)
             plan, velocities = following.check_tasks(
-                home, plan, workers=needed if is_here else 1
+                home, plan, names, workers=min(local.workers, needed) if is_here else 1
             )
-            if begun is None:
+            if begun is not None:
+                check_continues(place, begun, plan)
+            else:
                 make_directory(place)
                 stack.enter_context(_held(place))
                 _clear(place)
+                chunks = following.chunks_in(place, plan)
             write_plan(place, plan)
-            chunks = following.chunks_in(place, plan)
             # The slowest tasks come first, so that all workers finish at about the same
             # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
