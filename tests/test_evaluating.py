@@ -748,6 +748,22 @@ def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):
     assert begun(place) == 8
 
 
+def test_going_on_keeps_ranges_and_confidence(tmp_path):
+    """Unless others are given; then the rest stays."""
+    place, least = tmp_path / "e", {"directory": tmp_path / "e", "workers": 1}
+    run(place, score_ranges={PENDULUM: (0, 10)}, confidence=0.8, num_seeds=1)
+    before = contents(place)
+    evaluate(**least, resume=True)
+    assert contents(place) == before
+    changed = evaluate(**least, resume=True, confidence=0.9)
+    assert changed.bootstrap.confidence == 0.9
+    assert changed.summaries[0].score_range == (0, 10)
+    ranges = {PENDULUM: (0, 5)}
+    changed = evaluate(**least, resume=True, score_ranges=ranges)
+    assert changed.bootstrap.confidence == 0.9
+    assert changed.summaries[0].score_range == (0, 5)
+
+
 def test_force_deletes_the_evaluation_that_is_there(tmp_path):
     """And nothing else."""
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE])

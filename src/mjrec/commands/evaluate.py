@@ -76,7 +76,7 @@ def evaluate(
     score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     allow_nan: bool = False,
-    confidence: float = 0.95,
+    confidence: float | None = None,
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
@@ -123,7 +123,7 @@ def evaluate(
         fail_under: TASK=VALUE: exit with status 1 if the task's mean return is lower or
             one of its episodes failed. TASK may be a pattern. May be repeated.
         allow_nan: do not exit with status 1 because of NaN or infinite returns.
-        confidence: confidence level of the intervals.
+        confidence: confidence level of the intervals. Default: 0.95.
         as_json: print one JSON object at the end, and nothing else.
         engine_options: where to compute episodes and videos, if not in this command's
             own processes.

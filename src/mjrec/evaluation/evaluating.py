@@ -64,6 +64,7 @@ _DEFAULTS: Mapping[str, Any] = {
     "keep": "best,median,worst",
     "protocol": SEEDED,
     "quality": "full",
+    "confidence": 0.95,
 }
 
 _Tell = Callable[[following.EvaluationProgress], object]
@@ -92,7 +93,7 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    confidence: float = 0.95,
+    confidence: float | None = None,
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
@@ -135,7 +136,8 @@ def evaluate(
             one random stream, seeded with s.
         resume: continue the evaluation in the directory without rerunning finished
             episodes. Arguments that are None keep their earlier values. You may add
-            tasks, seeds and (except with `"suite"`) episodes. Everything else must be
+            tasks, seeds and (except with `"suite"`) episodes, and change
+            `score_ranges`, `confidence` and `episode_timeout`. Everything else must be
             the same, including the policy's code and weights, the models of MJCF
             files, and the modules that are imported when the environments and the
             policy are created. Installed packages are not compared.
@@ -155,7 +157,7 @@ def evaluate(
         policy_kwargs: keyword arguments for the policy.
         score_ranges: for each task, the returns that correspond to scores of 0 and 1.
             Scores make tasks comparable. dm_control tasks have default ranges.
-        confidence: confidence level of the intervals.
+        confidence: confidence level of the intervals. Defaults to 0.95.
         on_progress: a function that is called with the progress several times a second.
         engine: an executor to use instead of child processes, or `"local"`, `"ray"` or
             `"slurm"`. Its workers also render. All workers must see the directory under
@@ -174,7 +176,6 @@ def evaluate(
         Error: an argument, a task or the policy is invalid. All of the errors above
             are raised before any episode runs.
     """
-    how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
@@ -193,7 +194,9 @@ def evaluate(
         quality=quality,
         env_kwargs=env_kwargs or None,
         policy_kwargs=policy_kwargs or None,
+        confidence=confidence,
     )
+    how = Bootstrap(confidence=options["confidence"])
     if policy is None and begun is not None:
         if begun.is_object:
             raise PolicyError(
@@ -209,6 +212,7 @@ def evaluate(
         tasks, policy, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
     )
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
+    plan = replace(plan, score_ranges={**plan.score_ranges, **ranges})
     if begun is not None:
         check_continues(place, begun, plan)
     tell = on_progress or (lambda _: None)
@@ -253,7 +257,7 @@ def evaluate(
         choice = following.choose_videos(plan, chunks, results)
         # Written before the videos are drawn, because drawing takes a long time.
         scales = {
-            task.name: ranges.get(task.name)
+            task.name: plan.score_ranges.get(task.name)
             or default_score_range(task.name, task.step_limit)
             for task in plan.tasks
         }

@@ -43,7 +43,7 @@ Unit: TypeAlias = tuple[int, int]
 """The seed and episode number, which identify an episode within its task."""
 
 # Fields that may have changed when an evaluation is resumed.
-_MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
+_MAY_DIFFER = ("tasks", "chunks", "episode_timeout", "score_ranges", "confidence")
 
 _Positive: TypeAlias = Annotated[int, positive]
 
@@ -125,6 +125,8 @@ class EvaluationPlan:
             frame per step.
         quality: `"full"` or `"draft"`.
         env_kwargs: keyword arguments for each environment.
+        score_ranges: the given returns for scores of 0 and 1, by task.
+        confidence: confidence level of the intervals.
     """
 
     tasks: tuple[EvaluatedTask, ...]
@@ -146,6 +148,8 @@ class EvaluationPlan:
     max_fps: float | None = 60
     quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    score_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    confidence: float = 0.95
 
     @property
     def policy_and_kwargs(self) -> str:

@@ -120,6 +120,7 @@ def plan_from(
         is_object=payload is not None,
         policy_digests=digests,
         sources=begun.sources if begun else {},
+        score_ranges=begun.score_ranges if begun else {},
         **options,
     )
     chunks = chunks_of(plan, begun.chunks if begun else ())
