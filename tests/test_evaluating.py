@@ -764,6 +764,17 @@ def test_going_on_keeps_ranges_and_confidence(tmp_path):
     assert changed.summaries[0].score_range == (0, 5)
 
 
+@pytest.mark.parametrize(("first", "others"), [(30, (60, None)), (None, (60,))])
+def test_going_on_with_another_frame_rate_is_refused(tmp_path, first, others):
+    """Though it is the default, or none; without one, the first is kept."""
+    run(tmp_path / "e", max_fps=first, num_seeds=1, episodes=1)
+    for other in others:
+        with pytest.raises(DifferentEvaluation, match=f"max_fps was {first}.*{other}"):
+            evaluate(directory=tmp_path / "e", max_fps=other, resume=True)
+    same = evaluate(directory=tmp_path / "e", resume=True, workers=1)
+    assert same.plan.max_fps == first
+
+
 def test_force_deletes_the_evaluation_that_is_there(tmp_path):
     """And nothing else."""
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE])

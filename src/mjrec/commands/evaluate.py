@@ -18,7 +18,7 @@ import tyro
 
 from ..errors import InvalidArgument, UnknownName
 from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.evaluating import DEFAULT_FPS
+from ..evaluation.evaluating import NOT_GIVEN
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.following import EvaluationProgress
@@ -166,7 +166,7 @@ def evaluate(
                 camera=view_from,
                 height=height,
                 width=width,
-                max_fps=DEFAULT_FPS if max_fps is None else max_fps,
+                max_fps=NOT_GIVEN if max_fps is None else max_fps,
                 quality=quality,
                 env_kwargs=env_options,
                 policy_kwargs=policy_options,

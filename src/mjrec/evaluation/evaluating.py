@@ -58,11 +58,13 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
-DEFAULT_FPS = 60
+# For `max_fps`, of which None is a value.
+NOT_GIVEN: Any = object()
 _DEFAULTS: Mapping[str, Any] = {
     "episodes": 10,
     "keep": "best,median,worst",
     "protocol": SEEDED,
+    "max_fps": 60,
     "quality": "full",
     "confidence": 0.95,
 }
@@ -88,7 +90,7 @@ def evaluate(
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
-    max_fps: float | None = DEFAULT_FPS,
+    max_fps: float | None = NOT_GIVEN,
     quality: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
@@ -151,7 +153,7 @@ def evaluate(
         height: height of the videos in pixels. None for the environment's default.
         width: width of the videos in pixels. None for the environment's default.
         max_fps: maximum number of frames per second of simulated time. None for one
-            frame per step.
+            frame per step. Defaults to 60.
         quality: `"full"` (the default) or `"draft"`.
         env_kwargs: keyword arguments for each environment.
         policy_kwargs: keyword arguments for the policy.
@@ -190,12 +192,14 @@ def evaluate(
         camera=camera,
         height=height,
         width=width,
-        max_fps=max_fps,
+        max_fps=None,
         quality=quality,
         env_kwargs=env_kwargs or None,
         policy_kwargs=policy_kwargs or None,
         confidence=confidence,
     )
+    if max_fps is not NOT_GIVEN:
+        options["max_fps"] = max_fps
     how = Bootstrap(confidence=options["confidence"])
     if policy is None and begun is not None:
         if begun.is_object:
@@ -325,8 +329,6 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
     """Replace options that are None with their earlier values or their defaults."""
-    if begun is not None and given["max_fps"] == DEFAULT_FPS:
-        given["max_fps"] = None
     earlier = _DEFAULTS if begun is None else vars(begun)
     return {
         name: earlier.get(name) if value is None else value
