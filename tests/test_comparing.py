@@ -174,6 +174,11 @@ def test_other_conditions_are_a_caution(tmp_path):
     assert comparison.scored == ()
     within = compared([a, b], write_evaluation(tmp_path / "c", {WALK: [[1, 2]]}))
     assert "is 500 or the environment's own in A" in within.cautions[1]
+    # What varies on both sides in the same way is no difference between them.
+    for name, like in (("d", many), ("e", few)):
+        write_evaluation(tmp_path / name, like, versions=new)
+    same = compared([a, b], [tmp_path / "d", tmp_path / "e"])
+    assert [each.partition(":")[0] for each in same.remarks] == ["mujoco"]
 
 
 @pytest.mark.parametrize(

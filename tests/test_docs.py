@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 import mjrec
+import test_engines
 from mjrec.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
@@ -170,6 +171,23 @@ def test_system_packages_are_those_that_setup_installs():
     packages = [word for word in line.split() if word.startswith("lib")]
     assert packages
     assert all(package in SETUP for package in packages)
+
+
+def test_guarantees_are_listed_with_the_engines_that_are_tested():
+    """The page on clusters has a row for each test of engines, in their order."""
+    tested = []
+    for name, test in vars(test_engines).items():
+        if name.startswith("test_"):
+            [cases] = [m.args[1] for m in test.pytestmark if m.name == "parametrize"]
+            tested.append({getattr(each, "values", [each])[0] for each in cases})
+    text = (DOCS / "howto" / "clusters.md").read_text()
+    lines = text[text.index("|guarantee|") :].partition("\n\n")[0].splitlines()
+    [_, *names], _, *rows = (line.strip("|").split("|") for line in lines)
+    engines = [name.lower().split()[0] for name in names]
+    listed = [
+        {e for e, at in zip(engines, row, strict=True) if at == "✓"} for _, *row in rows
+    ]
+    assert listed == tested
 
 
 @pytest.mark.thorough

@@ -176,12 +176,16 @@ def engines(tmp_path_factory):
 # Takes more than five seconds: evaluations with videos, in workers that start for it.
 # Ray's own connections and pipes, of which it says so when they are collected.
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-@parametrize("kind", ["local", "ray", "slurm", "dask"], default=3)
+@parametrize(
+    ("kind", "workers"),
+    [("local", 5), ("ray", 2), ("slurm", 2), ("local", 2), ("dask", 2)],
+    default=3,
+)
 def test_workers_and_engines_change_nothing(
-    by_one_worker, large, engines, tmp_path, kind
+    by_one_worker, large, engines, tmp_path, kind, workers
 ):
     """Results, trajectories, videos and names are those of one worker."""
-    here, engine = by_one_worker, engines(kind, 2)
+    here, engine = by_one_worker, engines(kind, workers)
     there = large(tmp_path / "e", engine=engine, workers=None)
     engine.shutdown()
     assert contents(there.directory) == contents(here.directory)
@@ -418,8 +422,7 @@ def test_a_worker_that_dies_once_costs_nothing(tmp_path, caplog, protocol):
     lived = run(tmp_path / "lived", **options)
     assert [each.unit for each in died.failed] == [(5, 1)]
     assert contents(tmp_path / "died") == contents(tmp_path / "lived")
-    for one, other in zip(died.results, lived.results, strict=True):
-        assert np.array_equal(states_of(died, one), states_of(lived, other))
+    assert recorded_in(died) == recorded_in(lived)
 
 
 # Takes more than five seconds: three workers die, one after the other.
@@ -516,6 +519,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engin
     drawn = drawn_in(killed)
     assert slow_run(killed, engine, "resume").wait() == 0
     assert contents(killed) == contents(whole)
+    assert recorded_in(read_results(killed)) == recorded_in(read_results(whole))
     # Each once; those that the two workers were at, once more.
     assert 24 <= begun(killed) <= 26
     assert ended(killed) == 24
@@ -670,6 +674,12 @@ def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path):
     assert newly.name in listed_in(tmp_path / "e")
 
 
+ROBOT = """
+<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".5"/></body>
+</worldbody><actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
 class Weighted:
     """A policy with a weight."""
 
@@ -702,6 +712,31 @@ def test_another_policy_is_not_gone_on_with(tmp_path, monkeypatch):
         run(tmp_path / "named", **named, resume=True)
 
 
+def test_what_policy_and_file_refer_to_is_compared_too(tmp_path, monkeypatch):
+    """A module that the policy imports, and the model that an MJCF file compiles to."""
+    monkeypatch.chdir(tmp_path)
+    helper, robot = tmp_path / "own_gains.py", tmp_path / "robot.xml"
+    text = f"import {helper.stem}\ndef act(o):\n    return [{helper.stem}.GAIN]\n"
+    (tmp_path / "gain_policy.py").write_text(text)
+    helper.write_text("GAIN = 0.0\n")
+    robot.write_text(ROBOT)
+    options = {"tasks": ["robot.xml"], "policy": "gain_policy:act", "episodes": 1}
+    run(tmp_path / "e", **options, num_seeds=1)
+    helper.write_text("GAIN = 1.0\n")
+    robot.write_text(ROBOT.replace('"slide"', '"hinge"'))
+    # Where nothing is left to run, nothing can be mixed.
+    assert len(run(tmp_path / "e", **options, num_seeds=1, resume=True).results) == 1
+    with pytest.raises(DifferentEvaluation) as raised:
+        run(tmp_path / "e", **options, resume=True)
+    names = {"module own_gains", "model of robot.xml"}
+    assert {*raised.value.differences} == names
+    helper.write_text("GAIN = 0.0\n")
+    robot.write_text(f"<!-- the same -->{ROBOT}")
+    run(tmp_path / "e", **options, resume=True)
+    run(tmp_path / "whole", **options)
+    assert contents(tmp_path / "e") == contents(tmp_path / "whole")
+
+
 def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):
     """What is to be more is given; what is done is not done again."""
     place = tmp_path / "e"
@@ -715,6 +750,33 @@ def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):
     evaluate(directory=place, resume=True, workers=1)
     assert contents(place) == contents(reference)
     assert begun(place) == 8
+
+
+def test_going_on_keeps_ranges_and_confidence(tmp_path):
+    """Unless others are given; then the rest stays."""
+    place, least = tmp_path / "e", {"directory": tmp_path / "e", "workers": 1}
+    run(place, score_ranges={PENDULUM: (0, 10)}, confidence=0.8, num_seeds=1)
+    before = contents(place)
+    evaluate(**least, resume=True)
+    assert contents(place) == before
+    changed = evaluate(**least, resume=True, confidence=0.9)
+    assert changed.bootstrap.confidence == 0.9
+    assert changed.summaries[0].score_range == (0, 10)
+    ranges = {PENDULUM: (0, 5)}
+    changed = evaluate(**least, resume=True, score_ranges=ranges)
+    assert changed.bootstrap.confidence == 0.9
+    assert changed.summaries[0].score_range == (0, 5)
+
+
+@pytest.mark.parametrize(("first", "others"), [(30, (60, None)), (None, (60,))])
+def test_going_on_with_another_frame_rate_is_refused(tmp_path, first, others):
+    """Though it is the default, or none; without one, the first is kept."""
+    run(tmp_path / "e", max_fps=first, num_seeds=1, episodes=1)
+    for other in others:
+        with pytest.raises(DifferentEvaluation, match=f"max_fps was {first}.*{other}"):
+            evaluate(directory=tmp_path / "e", max_fps=other, resume=True)
+    same = evaluate(directory=tmp_path / "e", resume=True, workers=1)
+    assert same.plan.max_fps == first
 
 
 def test_force_deletes_the_evaluation_that_is_there(tmp_path):

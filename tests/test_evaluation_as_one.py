@@ -86,7 +86,10 @@ def test_it_is_listed_and_drawn_as_one(evaluation, capsys):
     another = ["--size", "16x16", "--workers", "1", "--json"]
     render = ["render", str(evaluation), "--episode", "0", *another]
     assert commands.main(render) == 0
-    assert len(json.loads(capsys.readouterr().out)["videos"]) == 4
+    drawn = json.loads(capsys.readouterr().out)
+    paths = {Path(drawn["directory"], each["name"]) for each in drawn["videos"]}
+    assert len(paths) == 4
+    assert all(path.is_file() for path in paths)
     [bundle] = evaluation.glob(f"{TASKS[0]}/seed-001/openaigym.trajectories.*.h5")
     name = bundle.name.replace("trajectories", "trajectory")
     one = bundle.with_name(name.replace(".h5", ".episode000000.h5"))

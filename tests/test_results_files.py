@@ -129,7 +129,7 @@ def test_results_are_gone_while_they_are_rewritten(tmp_path):
         written(tmp_path, files=lambda _: 1 / 0)
     assert not (tmp_path / "results.json").exists()
     assert not list(tmp_path.glob(".*"))
-    with pytest.raises(UnreadableFile, match="--resume"):
+    with pytest.raises(UnreadableFile, match=f"mjrec evaluate --resume {tmp_path} "):
         read_results(tmp_path)
 
 

@@ -18,7 +18,7 @@ import tyro
 
 from ..errors import InvalidArgument, UnknownName
 from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.evaluating import DEFAULT_FPS
+from ..evaluation.evaluating import NOT_GIVEN
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.following import EvaluationProgress
@@ -76,7 +76,7 @@ def evaluate(
     score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     allow_nan: bool = False,
-    confidence: float = 0.95,
+    confidence: float | None = None,
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
@@ -123,7 +123,7 @@ def evaluate(
         fail_under: TASK=VALUE: exit with status 1 if the task's mean return is lower or
             one of its episodes failed. TASK may be a pattern. May be repeated.
         allow_nan: do not exit with status 1 because of NaN or infinite returns.
-        confidence: confidence level of the intervals.
+        confidence: confidence level of the intervals. Default: 0.95.
         as_json: print one JSON object at the end, and nothing else.
         engine_options: where to compute episodes and videos, if not in this command's
             own processes.
@@ -166,7 +166,7 @@ def evaluate(
                 camera=view_from,
                 height=height,
                 width=width,
-                max_fps=DEFAULT_FPS if max_fps is None else max_fps,
+                max_fps=NOT_GIVEN if max_fps is None else max_fps,
                 quality=quality,
                 env_kwargs=env_options,
                 policy_kwargs=policy_options,

@@ -386,7 +386,8 @@ def _different(
     said = [[facts(each) for each in side.results] for side in (a, b)]
     for name in dict.fromkeys(name for side in said for fact in side for name in fact):
         of_a, of_b = ([fact.get(name, "none") for fact in side] for side in said)
-        if any(value != of_a[0] for value in (*of_a, *of_b)):
+        # Lists, because some values are not hashable.
+        if any((value in of_a) != (value in of_b) for value in (*of_a, *of_b)):
             yield name, _listed(of_a), _listed(of_b)
 
 

@@ -58,12 +58,15 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
-DEFAULT_FPS = 60
+# For `max_fps`, of which None is a value.
+NOT_GIVEN: Any = object()
 _DEFAULTS: Mapping[str, Any] = {
     "episodes": 10,
     "keep": "best,median,worst",
     "protocol": SEEDED,
+    "max_fps": 60,
     "quality": "full",
+    "confidence": 0.95,
 }
 
 _Tell = Callable[[following.EvaluationProgress], object]
@@ -87,12 +90,12 @@ def evaluate(
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
-    max_fps: float | None = DEFAULT_FPS,
+    max_fps: float | None = NOT_GIVEN,
     quality: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    confidence: float = 0.95,
+    confidence: float | None = None,
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
@@ -135,8 +138,11 @@ def evaluate(
             one random stream, seeded with s.
         resume: continue the evaluation in the directory without rerunning finished
             episodes. Arguments that are None keep their earlier values. You may add
-            tasks, seeds and (except with `"suite"`) episodes. Everything else must be
-            the same, including the policy's code and weights.
+            tasks, seeds and (except with `"suite"`) episodes, and change
+            `score_ranges`, `confidence` and `episode_timeout`. Everything else must be
+            the same, including the policy's code and weights, the models of MJCF
+            files, and the modules that are imported when the environments and the
+            policy are created. Installed packages are not compared.
         force: delete the evaluation in the directory first.
         max_steps: truncate episodes after this many steps. None for the environment's
             limit, or 1000 steps if it has no limit.
@@ -147,13 +153,13 @@ def evaluate(
         height: height of the videos in pixels. None for the environment's default.
         width: width of the videos in pixels. None for the environment's default.
         max_fps: maximum number of frames per second of simulated time. None for one
-            frame per step.
+            frame per step. Defaults to 60.
         quality: `"full"` (the default) or `"draft"`.
         env_kwargs: keyword arguments for each environment.
         policy_kwargs: keyword arguments for the policy.
         score_ranges: for each task, the returns that correspond to scores of 0 and 1.
             Scores make tasks comparable. dm_control tasks have default ranges.
-        confidence: confidence level of the intervals.
+        confidence: confidence level of the intervals. Defaults to 0.95.
         on_progress: a function that is called with the progress several times a second.
         engine: an executor to use instead of child processes, or `"local"`, `"ray"` or
             `"slurm"`. Its workers also render. All workers must see the directory under
@@ -172,7 +178,6 @@ def evaluate(
         Error: an argument, a task or the policy is invalid. All of the errors above
             are raised before any episode runs.
     """
-    how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
@@ -187,11 +192,15 @@ def evaluate(
         camera=camera,
         height=height,
         width=width,
-        max_fps=max_fps,
+        max_fps=None,
         quality=quality,
         env_kwargs=env_kwargs or None,
         policy_kwargs=policy_kwargs or None,
+        confidence=confidence,
     )
+    if max_fps is not NOT_GIVEN:
+        options["max_fps"] = max_fps
+    how = Bootstrap(confidence=options["confidence"])
     if policy is None and begun is not None:
         if begun.is_object:
             raise PolicyError(
@@ -207,6 +216,7 @@ def evaluate(
         tasks, policy, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
     )
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
+    plan = replace(plan, score_ranges={**plan.score_ranges, **ranges})
     if begun is not None:
         check_continues(place, begun, plan)
     tell = on_progress or (lambda _: None)
@@ -222,16 +232,23 @@ def evaluate(
         # Quick checks run locally, so that they do not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
-            needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
+            names = [task.name for task in plan.tasks]
+            needed = len(names) * len(plan.chunks)
+            if begun is not None:
+                chunks = following.chunks_in(place, plan)
+                missing = [each.task.name for each in chunks if not each.is_complete]
+                names, needed = [*dict.fromkeys(missing)], len(missing)
             plan, velocities = following.check_tasks(
-                home, plan, workers=needed if is_here else 1
+                home, plan, names, workers=min(local.workers, needed) if is_here else 1
             )
-            if begun is None:
+            if begun is not None:
+                check_continues(place, begun, plan)
+            else:
                 make_directory(place)
                 stack.enter_context(_held(place))
                 _clear(place)
+                chunks = following.chunks_in(place, plan)
             write_plan(place, plan)
-            chunks = following.chunks_in(place, plan)
             # The slowest tasks come first, so that all workers finish at about the same
             # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
@@ -244,7 +261,7 @@ def evaluate(
         choice = following.choose_videos(plan, chunks, results)
         # Written before the videos are drawn, because drawing takes a long time.
         scales = {
-            task.name: ranges.get(task.name)
+            task.name: plan.score_ranges.get(task.name)
             or default_score_range(task.name, task.step_limit)
             for task in plan.tasks
         }
@@ -312,8 +329,6 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
     """Replace options that are None with their earlier values or their defaults."""
-    if begun is not None and given["max_fps"] == DEFAULT_FPS:
-        given["max_fps"] = None
     earlier = _DEFAULTS if begun is None else vars(begun)
     return {
         name: earlier.get(name) if value is None else value

@@ -45,9 +45,7 @@ from .summaries import AcrossTasks, TaskSummary
 RESULTS_NAME = "results.json"
 _TABLE_NAME = "results.csv"
 _TIMING_NAME = "timing.csv"
-_UNFINISHED = (
-    "the evaluation is not finished; to continue it, run the same command with --resume"
-)
+_UNFINISHED = "the evaluation is not finished; mjrec evaluate --resume {} continues it"
 _NO_EVALUATION = "the directory contains no evaluation"
 RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
@@ -234,7 +232,8 @@ def read_summaries(directory: Path) -> Evaluation:
     path = directory / RESULTS_NAME
     if not path.exists():
         is_begun = (directory / PLAN_NAME).exists()
-        raise UnreadableFile(path, _UNFINISHED if is_begun else _NO_EVALUATION)
+        reason = _UNFINISHED.format(directory) if is_begun else _NO_EVALUATION
+        raise UnreadableFile(path, reason)
     with unreadable(path):
         read = from_json(_ResultsFile, read_versioned(path))
         if [each.task for each in read.tasks] != [

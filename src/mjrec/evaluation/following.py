@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,47 +138,52 @@ class Choice:
 
 
 def check_tasks(
-    run: Run, plan: EvaluationPlan, *, workers: int = 1
+    run: Run, plan: EvaluationPlan, names: Collection[str], *, workers: int = 1
 ) -> tuple[EvaluationPlan, Mapping[str, int]]:
-    """Check that workers can create the environment and policy of each new task.
+    """Check that workers can create the environment and policy of each task to run.
 
     The environments are not stepped.
 
     Args:
         run: the workers.
         plan: the plan of the evaluation.
-        workers: number of workers to start if there are new tasks. Each worker must
+        names: the tasks to run.
+        workers: number of workers to start if there are such tasks. Each worker must
             create an environment eventually, so all workers do so now, in parallel.
 
     Returns:
-        The plan with the tasks' step limits, and for each new task, a rough measure of
-        the cost of a step.
+        The plan with the tasks' step limits and sources, and for each checked task, a
+        rough measure of the cost of a step.
 
     Raises:
         Error: an environment or policy could not be created. This is the original error
             from the worker, such as an `UnknownName`.
     """
-    unknown = {task.name: task for task in plan.tasks if task.step_limit is None}
-    if unknown:
-        for number in range(max(len(unknown), workers)):
-            name = [*unknown][number % len(unknown)]
+    checked = {task.name: task for task in plan.tasks if task.name in names}
+    if checked:
+        for number in range(max(len(checked), workers)):
+            name = [*checked][number % len(checked)]
             run.submit(f"{number}", kind="check", task=name)
     velocities: dict[str, int] = {}
+    sources = {**plan.sources}
     for outcome in run.results():
         # `outcome` is only None after a timeout, and none is set here.
         assert outcome is not None
         said = outcome.value or {}
-        name = [*unknown][int(outcome.key) % len(unknown)]
+        name = [*checked][int(outcome.key) % len(checked)]
         if outcome.failure is not None:
             # The worker must have died, because mjrec's errors are returned as "error".
             raise EnvironmentNotMade(name, outcome.failure)
         if "error" in said:
             raise unpacked(said["error"])
-        limit = said["step_limit"]
-        unknown[name] = dataclasses.replace(unknown[name], step_limit=limit)
+        limit = checked[name].step_limit or said["step_limit"]
+        checked[name] = dataclasses.replace(checked[name], step_limit=limit)
         velocities[name] = said["velocities"]
-    tasks = tuple(unknown.get(task.name, task) for task in plan.tasks)
-    return dataclasses.replace(plan, tasks=tasks), velocities
+        sources |= said["sources"]
+    tasks = tuple(checked.get(task.name, task) for task in plan.tasks)
+    # Sorted, because the outcomes come in any order.
+    sources = dict(sorted(sources.items()))
+    return dataclasses.replace(plan, tasks=tasks, sources=sources), velocities
 
 
 def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:

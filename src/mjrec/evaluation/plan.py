@@ -43,7 +43,7 @@ Unit: TypeAlias = tuple[int, int]
 """The seed and episode number, which identify an episode within its task."""
 
 # Fields that may have changed when an evaluation is resumed.
-_MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
+_MAY_DIFFER = ("tasks", "chunks", "episode_timeout", "score_ranges", "confidence")
 
 _Positive: TypeAlias = Annotated[int, positive]
 
@@ -105,6 +105,9 @@ class EvaluationPlan:
         policy_kwargs: keyword arguments for the policy.
         policy_digests: SHA-256 of each part of the policy, keyed by a description of
             the part.
+        sources: SHA-256 of other sources of the results, keyed by a description of
+            each: the user's modules that workers imported (not those of installed
+            packages), and the compiled models of MJCF files.
         seeds: the seeds, in the order of the results.
         episodes: number of episodes per task and seed.
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
@@ -122,6 +125,8 @@ class EvaluationPlan:
             frame per step.
         quality: `"full"` or `"draft"`.
         env_kwargs: keyword arguments for each environment.
+        score_ranges: the given returns for scores of 0 and 1, by task.
+        confidence: confidence level of the intervals.
     """
 
     tasks: tuple[EvaluatedTask, ...]
@@ -129,6 +134,7 @@ class EvaluationPlan:
     is_object: bool = False
     policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
     policy_digests: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
     seeds: tuple[int, ...]
     episodes: _Positive
     protocol: Protocol = SEEDED
@@ -142,6 +148,8 @@ class EvaluationPlan:
     max_fps: float | None = 60
     quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    score_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    confidence: float = 0.95
 
     @property
     def policy_and_kwargs(self) -> str:
@@ -227,6 +235,9 @@ def check_continues(
         plan["policy"] = "an object" if plan.pop("is_object") else plan["policy"]
         for part, digest in plan.pop("policy_digests").items():
             plan[f"policy ({part})"] = f"{digest[:12]}..."
+        sources = plan.pop("sources")
+        # Added tasks may have more sources.
+        plan |= {name: f"{sources[name][:12]}..." for name in begun.sources}
     may_differ = [*_MAY_DIFFER]
     if set(begun.seeds) <= set(asked.seeds):
         may_differ.append("seeds")

@@ -2,8 +2,9 @@
 """Creating and checking the plan of an evaluation, without any environment.
 
 A digest is stored for each part of a policy: the source file of its module, each file
-named in its arguments, and the pickled content of an object. The digests prevent a
-resumed evaluation from mixing the results of different policies.
+named in its arguments, and the pickled content of an object. Workers add the digests of
+imported modules. The digests prevent a resumed evaluation from mixing the results of
+different policies.
 """
 
 from __future__ import annotations
@@ -118,6 +119,8 @@ def plan_from(
         policy=policy_name,
         is_object=payload is not None,
         policy_digests=digests,
+        sources=begun.sources if begun else {},
+        score_ranges=begun.score_ranges if begun else {},
         **options,
     )
     chunks = chunks_of(plan, begun.chunks if begun else ())

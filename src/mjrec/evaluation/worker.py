@@ -9,10 +9,11 @@ that works on its machine. `"command"` is the command line to store in recording
 There are two kinds of jobs, and repeating a job is safe.
 
 `check`  Creates the environment and the policy without taking a step. The arguments are
-         `{"task"}`. Returns `{"step_limit", "velocities"}`, where `velocities` is the
-         number of degrees of freedom (0 without MuJoCo). If creation fails, returns
-         `{"error": ...}` instead, packed by `messages.carried`. The caller can then
-         raise the same error, and no traceback is logged.
+         `{"task"}`. Returns `{"step_limit", "velocities", "sources"}`, where
+         `velocities` is the number of degrees of freedom (0 without MuJoCo), and
+         `sources` is as in the plan. If creation fails, returns `{"error": ...}`
+         instead, packed by `messages.carried`. The caller can then raise the same
+         error, and no traceback is logged.
 `run`    Runs the missing episodes of a chunk. The arguments are `{"task", "folder",
          "chunk"}`. Returns `{"models": [...]}` with the SHA-256 of each compiled model
          that the worker has stored.
@@ -30,24 +31,29 @@ in three cases:
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import pickle
 import re
+import sys
+import sysconfig
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from .. import provenance
-from ..atomic_files import make_directory
+from ..atomic_files import file_sha256, make_directory
 from ..engines.jobs import TRIES
 from ..engines.worker import time_limit
 from ..environments.episode_seeds import episode_seeds, seed_global_generators
 from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
-from ..environments.names import working_directory_importable
+from ..environments.names import parse_environment_name, working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..environments.scenes import mujoco_warnings, new_warnings, simulation_below
 from ..errors import Error, GLError, InvalidArgument, PolicyError
@@ -79,6 +85,8 @@ _LOCK = ".mjrec.chunk.lock"
 _OF_EPISODES = (PolicyError, InvalidArgument)
 _LONGEST_FAILURE = 2000
 _LONGEST_UID = 100
+_MJREC = __name__.partition(".")[0]
+_INSTALLED = {sysconfig.get_path("stdlib"), "site-packages", "dist-packages"}
 _OUTSIDE_UID = re.compile(r"[^A-Za-z0-9_.-]")
 
 
@@ -113,6 +121,7 @@ class EvaluationWorker:
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
+        self._own_modules = {*sys.modules}
         self._directory = Path(settings["directory"])
         self.plan = from_json(EvaluationPlan, settings["plan"])
         # A reader of the recordings needs the command that started the evaluation.
@@ -209,9 +218,17 @@ class EvaluationWorker:
         except Error as error:
             return {"error": carried(error)}
         simulation = simulation_below(named.environment)
+        sources = _imported(self._own_modules)
+        if parse_environment_name(task).framework == "mjcf":
+            # Imported here because it loads MuJoCo.
+            from ..simulation.model_store import saved_model
+
+            model = hashlib.sha256(saved_model(simulation.model).data).hexdigest()
+            sources[f"model of {task}"] = model
         return {
             "step_limit": named.step_limit,
             "velocities": 0 if simulation is None else int(simulation.model.nv),
+            "sources": sources,
         }
 
     def _make(self, task: str, seed: int) -> Acting:
@@ -426,6 +443,23 @@ def _play(
         while not done:
             observation, _, *ends = named.step(env, policy(observation))
             done = any(ends)
+
+
+def _imported(ignored: AbstractSet[str]) -> dict[str, str]:
+    """Return the SHA-256 of each imported module, without installed packages."""
+    found = {}
+    for name, module in [*sys.modules.items()]:
+        # Read in this way because a lazy module would run code.
+        file = vars(module).get("__file__") if isinstance(module, ModuleType) else None
+        if (
+            isinstance(file, str)
+            and name not in ignored
+            and not name.startswith(f"{_MJREC}.")
+            and not _INSTALLED & {*map(str, Path(file).parents), *Path(file).parts}
+        ):
+            with contextlib.suppress(OSError):
+                found[f"module {name}"] = file_sha256(Path(file))
+    return found
 
 
 def _uid(folder: Path) -> str:

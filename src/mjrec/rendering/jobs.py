@@ -9,6 +9,7 @@ replaces the file with an identical one.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -270,7 +271,8 @@ class RenderedVideos:
     """The results of rendering, keyed by file name.
 
     Attributes:
-        directory: the directory of the videos.
+        directory: the directory of the videos. If they lie in several, the one that
+            contains them all, and the names are relative paths.
         videos: number of frames of each rendered video.
         trajectories: the finished trajectories of episodes without a video.
         failures: the reason for each video that could not be rendered.
@@ -287,20 +289,31 @@ class RenderedVideos:
 
     @classmethod
     def joined(cls, parts: Iterable[Self], directory: Path) -> Self:
-        """Combine several results, in which each name occurs only once.
+        """Combine several results, in which each path occurs only once.
 
         Args:
             parts: the results.
             directory: the directory of the videos, if there are no results.
         """
         parts = list(parts)
+        if parts:
+            directory = Path(os.path.commonpath([part.directory for part in parts]))
+        placed = [(part.directory.relative_to(directory), part) for part in parts]
         return cls(
-            directory=parts[-1].directory if parts else directory,
-            videos={name: n for part in parts for name, n in part.videos.items()},
-            trajectories=tuple(name for part in parts for name in part.trajectories),
-            failures={name: w for part in parts for name, w in part.failures.items()},
-            blank={name: why for part in parts for name, why in part.blank.items()},
-            elsewhere=tuple(name for part in parts for name in part.elsewhere),
+            directory=directory,
+            videos={
+                str(at / x): n for at, part in placed for x, n in part.videos.items()
+            },
+            trajectories=tuple(
+                str(at / x) for at, part in placed for x in part.trajectories
+            ),
+            failures={
+                str(at / x): w for at, part in placed for x, w in part.failures.items()
+            },
+            blank={
+                str(at / x): w for at, part in placed for x, w in part.blank.items()
+            },
+            elsewhere=tuple(str(at / x) for at, part in placed for x in part.elsewhere),
         )
 
     def _repr_html_(self) -> str:
