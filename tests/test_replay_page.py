@@ -66,6 +66,18 @@ _ROPE = """
 </mujoco>
 """
 
+# A hand that is moved from outside comes first, as in Fetch.
+_PICKER = """
+<mujoco>
+  <worldbody>
+    <body name="hand" mocap="true" pos="9 0 0"><geom size=".1"/></body>
+    <body pos="0 0 1">
+      <body name="arm"><joint axis="0 1 0"/><geom size=".2" pos=".5 0 0"/></body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
 _BOX = """
 <mujoco>
   <asset>
@@ -196,6 +208,12 @@ def data_at(trajectory, step):
     trajectory.set_state(data, step)
     mujoco.mj_forward(data.model, data)
     return data
+
+
+def data_in(page):
+    """Return what a page's script reads."""
+    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
+    return json.loads(text)
 
 
 def check_geoms(page, data):
@@ -416,11 +434,18 @@ def test_colours_change_when_the_model_does(tmp_path):
     path = record("Hopper-v5", tmp_path, 4, change)
     page = tmp_path / "page.html"
     mjrec.write_replay(mjrec.load_trajectory(path), page)
-    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
-    colours = {each[1]: each for each in json.loads(text)["chunk"]["colours"]}
+    colours = {each[1]: each for each in data_in(page)["chunk"]["colours"]}
     assert colours["/geom/2"] == [3, "/geom/2", [1, 0, 0, 1]]
     assert colours["/geom/3"][0] == 3
     assert colours["/geom/3"][2][3] == 0
+
+
+def test_the_view_follows_what_joints_move(tmp_path):
+    """It is the first tree with a joint, not a mocap body that comes before it."""
+    trajectory = recorded_model(_PICKER, tmp_path, steps=2)
+    page = mjrec.write_replay(trajectory, tmp_path / "page.html").path
+    centre = data_at(trajectory, 0).body("arm").subtree_com
+    assert data_in(page)["start"] == pytest.approx(centre)
 
 
 def test_sides_have_the_whole_texture_and_normals(tmp_path):

@@ -357,6 +357,13 @@ def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _tracked_body(model: mujoco.MjModel) -> int:
-    """Return the root of the first moving body's tree; the world if nothing moves."""
-    moving = np.flatnonzero(model.body_weldid != 0)
-    return int(model.body_rootid[moving[0]]) if len(moving) else 0
+    """Return the root of the tree that the first joint moves; the world without joints.
+
+    Mocap bodies do not count: they may jump, or be far away.
+    """
+    if model.njnt == 0:
+        return 0
+    body = int(model.jnt_bodyid[0])
+    while model.body_weldid[parent := int(model.body_parentid[body])] != 0:
+        body = parent
+    return body
