@@ -18,6 +18,7 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.commands import main
+from mjrec.errors import UnreadableFile
 
 pytest.importorskip("viser")
 pytest.importorskip("mjviser")
@@ -420,6 +421,7 @@ def test_what_cannot_be_shown_is_left_out(cheetah, tmp_path):
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
+    assert made.notes == ("States left out because they are not finite: 1 of 13.",)
     assert "<script>alert" not in made.path.read_text()
 
 
@@ -448,6 +450,39 @@ def test_the_view_follows_what_joints_move(tmp_path):
     assert data_in(page)["start"] == pytest.approx(centre)
 
 
+def test_what_appears_later_is_there_hidden(tmp_path):
+    """A geom that the first state does not show is part of the page."""
+
+    def change(env, step):
+        env.unwrapped.model.geom_rgba[2] = (1, 0, 0, step > 2)
+
+    trajectory = mjrec.load_trajectory(record("Hopper-v5", tmp_path, 4, change))
+    trajectory.states[0] = np.nan
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
+    assert made.notes == ("States left out because they are not finite: 1 of 5.",)
+    data = data_in(tmp_path / "page.html")
+    assert data["rgba"]["/geom/2"][3] == 0
+    assert data["chunk"]["colours"] == [[2, "/geom/2", [1, 0, 0, 1]]]
+
+
+@pytest.mark.parametrize(
+    ("field", "kind"),
+    [("geom_size", "Sizes and meshes"), ("mat_texrepeat", "Textures")],
+)
+def test_changes_that_are_not_shown_are_named(field, kind, tmp_path, caplog):
+    """Shapes and their images stay as at the reset; the page and the log say so."""
+
+    def change(env, step):
+        if step == 2:
+            getattr(env.unwrapped.model, field)[:] *= 2
+
+    path = record("Hopper-v5", tmp_path, 4, change)
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    assert made.notes == (f"{kind} change during the episode but not on this page.",)
+    assert made.notes[0] in caplog.text
+    assert f"<p>{made.notes[0]}</p>" in made.path.read_text()
+
+
 def test_sides_have_the_whole_texture_and_normals(tmp_path):
     """One image for all sides is not cut into six; round shapes look smooth."""
     Image.new("RGB", (8, 8), "red").save(tmp_path / "side.png")
@@ -459,6 +494,14 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
     assert b"NORMAL" in mesh.export(file_type="glb")
     top = mesh.vertex_normals[:, 2] > 0.9
     assert np.ptp(mesh.visual.uv[top], axis=0) == pytest.approx([1, 1])
+
+
+def test_an_episode_without_finite_states_is_refused(cheetah, tmp_path):
+    """The error names the file and says why there is nothing to show."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    trajectory.states[:] = np.nan
+    with pytest.raises(UnreadableFile, match="none of its 13 states is finite"):
+        mjrec.write_replay(trajectory, tmp_path / "page.html")
 
 
 def test_the_page_says_what_it_does_not_show(tmp_path, caplog):

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_files import write_text
+from ..errors import UnreadableFile
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.trajectories import Trajectory
 from .geometry import linear, scene_page
@@ -76,12 +77,21 @@ def write_replay(
     Raises:
         InvalidArgument: `max_fps` is not a valid rate.
         MissingDependency: viser or mjviser is not installed.
-        UnreadableFile: the file is damaged, or was recorded without a simulation.
+        UnreadableFile: the file is damaged, was recorded without a simulation, or has
+            no finite state.
         UntrustedModel: see `Trajectory.model`.
         FileNotWritten: the disk is full.
     """
-    stage = Stage(trajectory)
-    motion = stage.motion(trajectory, shown_steps(trajectory, max_fps))
+    steps = shown_steps(trajectory, max_fps)
+    count, total = int(_are_finite(trajectory.states).sum()), len(trajectory.states)
+    if count == 0:
+        reason = f"none of its {total} states is finite"
+        raise UnreadableFile(trajectory.path, reason)
+    stage = Stage(trajectory, first=int(steps[0]))
+    motion = stage.motion(trajectory, steps)
+    if count < total:
+        left = f"{total - count} of {total}"
+        stage.notes.append(f"States left out because they are not finite: {left}.")
     for note in stage.notes:
         _LOG.warning("%s: %s", trajectory.path.name, note)
     page = replay_page(trajectory, stage, motion)
@@ -109,7 +119,11 @@ def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int
     steps = np.arange(0, count, stride)
     if count and steps[-1] != count - 1:
         steps = np.append(steps, count - 1)
-    return steps[np.isfinite(trajectory.states[steps]).all(axis=1)]
+    return steps[_are_finite(trajectory.states[steps])]
+
+
+def _are_finite(states: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(states).all(axis=1))
 
 
 def replay_page(

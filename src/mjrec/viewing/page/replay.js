@@ -136,6 +136,9 @@
       part.material.color.setRGB(rgba[0], rgba[1], rgba[2]);
       part.material.opacity = rgba[3];
       part.material.transparent = rgba[3] < 1;
+      part.material.depthWrite = rgba[3] === 1;
+      // Opaque materials are compiled without opacity.
+      part.material.needsUpdate = true;
       shown.set(name, rgba);
     });
   }
