@@ -277,13 +277,32 @@ def test_keys_go_through_the_states(page, cheetah):
     page.keyboard.press("End")
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
-    data = data_at(trajectory, _STEPS)
-    check_geoms(page, data)
-    # The model's cameras can be chosen, and move as they do in the videos.
+    check_geoms(page, data_at(trajectory, _STEPS))
+
+
+@pytest.mark.browser
+def test_a_camera_of_the_model_is_kept_from_step_to_step(page, cheetah):
+    """It moves as in the videos, also if it has the name of one of the page's."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    page.keyboard.press("End")
     page.select_option("#replay-camera", label="track")
-    position, fovy = page.evaluate(_CAMERA)
-    assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
-    assert fovy == pytest.approx(data.model.cam_fovy[0])
+    for step in (_STEPS, _STEPS - 1):
+        data = data_at(trajectory, step)
+        position, fovy = page.evaluate(_CAMERA)
+        assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
+        assert fovy == pytest.approx(data.model.cam_fovy[0])
+        assert f"#step={step}&camera=0&" in page.evaluate("location.hash")
+        page.keyboard.press(",")
+    page.select_option("#replay-camera", label="tracking")
+
+
+@pytest.mark.browser
+def test_speeds_end_at_the_slowest_and_the_fastest(page):
+    """Keys beyond the ends change nothing."""
+    for key, speed in (("]", "4"), ("[", "0.1")):
+        for _ in range(8):
+            page.keyboard.press(key)
+        assert page.input_value("#replay-speed") == speed
 
 
 @pytest.mark.browser

@@ -151,8 +151,7 @@ def replay_page(
     )
     notes = "".join(f"<p>{html.escape(note)}</p>" for note in about["notes"])
     options = "".join(
-        f'<option value="{number}" data-name="{html.escape(camera["name"])}">'
-        f"{html.escape(camera['name'])}</option>"
+        f'<option value="{number}">{html.escape(camera["name"])}</option>'
         for number, camera in enumerate(about["cameras"])
     )
     controls = _file("replay.html").format(
@@ -250,7 +249,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
         "ending": ending_of(trajectory),
         "hasRewards": bool(len(trajectory.rewards)),
         "cameras": cameras,
-        "camera": "track" if number is None else cameras[number]["name"],
+        "camera": "track" if number is None else str(number),
         "extent": float(model.stat.extent),
         "view": {"position": position, "target": target, "fovy": fovy},
         "start": motion.target[0].tolist(),
