@@ -39,6 +39,7 @@ _FIXED = {
     ),
     "Textures": ("tex_data", "mat_texid", "mat_texrepeat", "geom_matid"),
 }
+FIXED_FIELDS = tuple(name for names in _FIXED.values() for name in names)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@
   const about = JSON.parse(document.getElementById("replay-data").textContent);
   if (!about.live) return;
   const element = (id) => document.getElementById(id);
-  const token = new URLSearchParams(location.search).get("token");
+  const asked = new URLSearchParams(location.search);
+  const token = asked.get("token");
   const replay = () => window.mjrecReplay;
   let episode = about.episode, wanted = episode, known = 0, hasMore = false, returns = [];
 
@@ -24,7 +25,9 @@
     }
     const told = await ask("/motion", { episode, from: known });
     if (told.scene !== about.scene) {
-      location.search = new URLSearchParams({ token, episode });
+      // The scene makes the address another one, so that the page is loaded again.
+      const follow = element("live-follow").checked;
+      location.search = new URLSearchParams({ token, episode, follow, scene: told.scene });
       return;
     }
     if (known === 0) replay().begin(told);
@@ -96,6 +99,7 @@
   }
 
   element("live").hidden = false;
+  element("live-follow").checked = asked.get("follow") !== "false";
   forever(motion, 300);
   forever(list, 1000);
 })();
