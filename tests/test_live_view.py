@@ -4,6 +4,7 @@
 import base64
 import contextlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -81,7 +82,7 @@ def test_new_states_of_a_running_episode_are_served(tmp_path):
         told = ask(view, "/episodes")
         first, second = told["episodes"]
         assert (first["label"], first["length"]) == ("0", STEPS)
-        assert (second["label"], "length" in second) == ("1", False)
+        assert (second["label"], second["running"]) == ("1", True)
         assert len(told["returns"]) == told["count"] == 1
         motion = ask(view, "/motion", episode=second["name"])
         assert (motion["steps"], motion["chunk"]["count"]) == (1, 2)
@@ -142,6 +143,20 @@ def test_a_tendon_that_begins_to_wrap_gets_its_segments(tmp_path):
         then, several = page()
     assert one == 1 < several
     assert first != then == asked[0]["scene"] == asked[1]["scene"]
+
+
+def test_an_episode_that_a_kill_cut_is_not_called_running(tmp_path):
+    """Only an open monitor has running episodes."""
+    # A copy of an open run is what a kill leaves: nobody holds its lock.
+    with begin(tmp_path / "open") as run:
+        run.reset(seed=1)
+        run.step(np.zeros(3))
+        shutil.copytree(tmp_path / "open", tmp_path / "killed")
+    with served(tmp_path / "killed") as view:
+        _, cut = ask(view, "/episodes")["episodes"]
+        assert cut["running"] is False
+        motion = ask(view, "/motion", episode=cut["name"])
+    assert motion["ending"] == "End of the recording"
 
 
 @pytest.mark.parametrize("port", [-1, 65536])

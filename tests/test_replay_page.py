@@ -378,6 +378,36 @@ def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
 
 
 @pytest.mark.browser
+def test_a_chosen_episode_is_shown_with_its_shapes_and_its_name(pages, tmp_path):
+    """Also if the page is loaded again for other shapes: it does not jump back."""
+    env = gymnasium.make("Hopper-v5", max_episode_steps=2)
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=0) as run:
+        for radius in (0.05, 0.2):
+            run.unwrapped.model.geom_size[2, 0] = radius
+            run.reset(seed=0)
+            run.step(np.zeros(3))
+            run.step(np.zeros(3))
+    with LiveView(tmp_path) as view:
+        thread = threading.Thread(target=view.serve)
+        thread.start()
+        try:
+            page = pages(view.url)
+            for number, width in ((1, 0.4), (0, 0.1)):
+                page.click(f"#live-episodes li:has-text('{number}: 2 steps')")
+                title = f"Hopper-v5, episode {number}"
+                page.wait_for_function("(said) => document.title === said", arg=title)
+                page.wait_for_selector("html[data-replay=ready]", state="attached")
+                page.wait_for_selector("#live-episodes [aria-pressed=true]")
+                assert f"{title}: recorded" in page.inner_text("#replay")
+                shown = np.reshape(page.evaluate(_VERTICES, "/geom/2"), (-1, 3))
+                assert np.ptp(shown, axis=0).min() == pytest.approx(width, rel=0.1)
+                assert page.inner_text("#live-count") == "Complete episodes: 2"
+        finally:
+            view.close()
+            thread.join()
+
+
+@pytest.mark.browser
 @pytest.mark.thorough
 def test_tendons_and_cloth_move(pages, tmp_path):
     """What changes its shape has the vertices and the segments that MuJoCo computes."""

@@ -25,13 +25,19 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from ..errors import Error, InvalidArgument
-from ..formats.monitor_directory import episode_of, infix_of, recording_directories
+from ..formats.locks import is_locked
+from ..formats.monitor_directory import (
+    episode_of,
+    infix_of,
+    lock_name,
+    recording_directories,
+)
 from ..results import iter_episodes
 from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
 from .geometry import linear
 from .motion import FIXED_FIELDS, Shape, Stage
-from .replay import ending_of, motion_chunk, replay_page
+from .replay import ending_of, motion_chunk, replay_page, title_of
 
 _ADDRESS = "127.0.0.1"
 _MOST_PORTS = 65_535
@@ -219,6 +225,8 @@ class LiveView:
             entry: dict[str, Any] = {"name": self._name(path), "label": label}
             if (over := ended.get(path)) is not None:
                 entry |= {"length": over.length, "return": _number(over.reward)}
+            else:
+                entry["running"] = _is_running(path)
             listed.append(entry)
         stride = max(1, -(-len(returns) // _MOST_POINTS))
         curve = [_number(each) for each in returns[::stride]]
@@ -227,10 +235,12 @@ class LiveView:
     def _motion(self, name: str, first: int) -> dict[str, Any]:
         trajectory, shown = self._load(self._known()[name], first)
         last = min(len(trajectory.states), first + _MOST_STATES)
+        is_going_on = not trajectory.complete and _is_running(trajectory.path)
         told: dict[str, Any] = {
             "steps": len(trajectory),
             "hasMore": last < len(trajectory.states),
-            "ending": ending_of(trajectory) if trajectory.complete else "",
+            "title": title_of(trajectory),
+            "ending": "" if is_going_on else ending_of(trajectory),
             "rgba": {s.name: linear(s.rgba) for s in shown.stage.shapes},
         }
         if first < last:
@@ -280,6 +290,11 @@ def _digest(*parts: str | bytes) -> str:
     for part in parts:
         digest.update(part if isinstance(part, bytes) else part.encode())
     return digest.hexdigest()[:16]
+
+
+def _is_running(path: Path) -> bool:
+    """Return whether the monitor that records an unfinished episode is still open."""
+    return is_locked(path.parent / lock_name(infix_of(path.name) or ""))
 
 
 def _number(value: float) -> float | None:

@@ -236,7 +236,7 @@ def _skin(stage: Stage, skin: int) -> dict[str, Any]:
 
 
 def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, Any]:
-    model, episode = stage.model, trajectory.episode_id
+    model = stage.model
     position, target, fovy = stage.view
     cameras = [
         {"name": model.camera(i).name or str(i), "fovy": float(model.cam_fovy[i])}
@@ -244,7 +244,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
     ]
     number = stage.camera_number
     return {
-        "title": f"{trajectory.env_id or 'Recording'}, episode {episode}",
+        "title": title_of(trajectory),
         "steps": len(trajectory),
         "ending": ending_of(trajectory),
         "hasRewards": bool(len(trajectory.rewards)),
@@ -266,6 +266,11 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
         "notes": stage.notes,
         "chunk": motion_chunk(motion),
     }
+
+
+def title_of(trajectory: Trajectory) -> str:
+    """Return the title of an episode's page."""
+    return f"{trajectory.env_id or 'Recording'}, episode {trajectory.episode_id}"
 
 
 def ending_of(trajectory: Trajectory) -> str:

@@ -34,19 +34,21 @@
     if (told.chunk) await replay().append(told.chunk);
     known += told.chunk?.count ?? 0;
     hasMore = told.hasMore;
-    replay().tell(told.steps, told.ending);
+    replay().tell(told);
     if (told.chunk) replay().newest(element("live-follow").checked);
   }
 
   async function list() {
     const told = await ask("/episodes");
     returns = told.returns;
-    element("live-count").textContent = `${told.count} episodes have ended`;
+    const cut = told.episodes.filter((each) => each.running === false).length;
+    const early = cut ? `; ended early: ${cut}` : "";
+    element("live-count").textContent = `Complete episodes: ${told.count}${early}`;
     const rows = told.episodes.toReversed().map((each) => {
       const button = document.createElement("button");
       button.type = "button";
-      button.textContent = each.length === undefined
-        ? `${each.label}: running`
+      button.textContent = "running" in each
+        ? `${each.label}: ${each.running ? "running" : "ended early"}`
         : `${each.label}: ${each.length} steps, return ${each.return?.toPrecision(5) ?? "NaN"}`;
       button.setAttribute("aria-pressed", each.name === episode);
       button.addEventListener("click", () => {

@@ -388,9 +388,11 @@
     followed = null;
   }
 
-  function tell(steps, ending) {
+  function tell({ steps, ending, title }) {
     about.steps = steps;
     about.ending = ending;
+    document.title = title;
+    element("replay-title").textContent = title;
   }
 
   function newest(isWanted) {
