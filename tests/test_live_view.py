@@ -159,6 +159,24 @@ def test_an_episode_that_a_kill_cut_is_not_called_running(tmp_path):
     assert motion["ending"] == "End of the recording"
 
 
+def test_states_that_are_not_finite_are_left_out(tmp_path, monkeypatch):
+    """The page goes on after them, at the state that it is told."""
+
+    def load(path, **options):
+        trajectory = mjrec.load_trajectory(path, **options)
+        trajectory.states[STEPS] = np.nan
+        return trajectory
+
+    monkeypatch.setattr("mjrec.viewing.live.load_trajectory", load)
+    begin(tmp_path).close()
+    with served(tmp_path) as view:
+        [episode] = ask(view, "/episodes")["episodes"]
+        told = ask(view, "/motion", episode=episode["name"])
+        assert (told["chunk"]["count"], told["next"]) == (STEPS, STEPS + 1)
+        then = {"episode": episode["name"], "from": STEPS}
+        assert "chunk" not in ask(view, "/motion", **then)
+
+
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_that_does_not_exist_is_refused(port, tmp_path):
     """The error says which ports there are."""

@@ -37,7 +37,7 @@ from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
 from .geometry import linear
 from .motion import FIXED_FIELDS, Shape, Stage
-from .replay import ending_of, motion_chunk, replay_page, title_of
+from .replay import are_finite, ending_of, motion_chunk, replay_page, title_of
 
 _ADDRESS = "127.0.0.1"
 _MOST_PORTS = 65_535
@@ -238,14 +238,17 @@ class LiveView:
         is_going_on = not trajectory.complete and _is_running(trajectory.path)
         told: dict[str, Any] = {
             "steps": len(trajectory),
+            "next": max(first, last),
             "hasMore": last < len(trajectory.states),
             "title": title_of(trajectory),
             "ending": "" if is_going_on else ending_of(trajectory),
             "rgba": {s.name: linear(s.rgba) for s in shown.stage.shapes},
         }
-        if first < last:
-            shown.next = last
-            motion = shown.stage.motion(trajectory, np.arange(first, last))
+        shown.next = max(first, last)
+        steps = np.arange(first, last)
+        steps = steps[are_finite(trajectory.states[first:last])]
+        if len(steps):
+            motion = shown.stage.motion(trajectory, steps)
             told["start"] = motion.target[0].tolist()
             told["chunk"] = motion_chunk(motion, keep_all=True)
         return {**told, "scene": shown.scene_id}

@@ -83,15 +83,16 @@ def write_replay(
         FileNotWritten: the disk is full.
     """
     steps = shown_steps(trajectory, max_fps)
-    count, total = int(_are_finite(trajectory.states).sum()), len(trajectory.states)
-    if count == 0:
-        reason = f"none of its {total} states is finite"
+    if not len(steps):
+        reason = "none of the states to show is finite"
         raise UnreadableFile(trajectory.path, reason)
     stage = Stage(trajectory, first=int(steps[0]))
     motion = stage.motion(trajectory, steps)
-    if count < total:
-        left = f"{total - count} of {total}"
-        stage.notes.append(f"States left out because they are not finite: {left}.")
+    if left := int((~are_finite(trajectory.states)).sum()):
+        stage.notes.append(
+            "States left out because they are not finite: "
+            f"{left} of {len(trajectory.states)}."
+        )
     for note in stage.notes:
         _LOG.warning("%s: %s", trajectory.path.name, note)
     page = replay_page(trajectory, stage, motion)
@@ -119,10 +120,11 @@ def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int
     steps = np.arange(0, count, stride)
     if count and steps[-1] != count - 1:
         steps = np.append(steps, count - 1)
-    return steps[_are_finite(trajectory.states[steps])]
+    return steps[are_finite(trajectory.states[steps])]
 
 
-def _are_finite(states: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_finite(states: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which states contain only finite numbers."""
     return np.asarray(np.isfinite(states).all(axis=1))
 
 

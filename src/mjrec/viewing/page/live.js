@@ -32,7 +32,7 @@
     }
     if (known === 0) replay().begin(told);
     if (told.chunk) await replay().append(told.chunk);
-    known += told.chunk?.count ?? 0;
+    known = told.next;
     hasMore = told.hasMore;
     replay().tell(told);
     if (told.chunk) replay().newest(element("live-follow").checked);
