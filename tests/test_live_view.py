@@ -4,6 +4,7 @@
 import base64
 import contextlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,11 +19,28 @@ import numpy as np
 import pytest
 
 import mjrec
+from mjrec.commands import main
+from mjrec.errors import InvalidArgument
 
 pytest.importorskip("viser")
 from mjrec.viewing.live import LiveView
 
 STEPS = 3
+# A weight on a thread falls beside a pulley.
+WRAPPING = """
+<mujoco>
+  <worldbody>
+    <site name="above" pos="0 0 1"/>
+    <geom name="pulley" type="cylinder" size=".1 .1" pos=".15 0 .7" euler="90 0 0"/>
+    <body pos=".3 0 1.2">
+      <freejoint/> <geom size=".05"/> <site name="below"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial> <site site="above"/> <geom geom="pulley"/> <site site="below"/> </spatial>
+  </tendon>
+</mujoco>
+"""
 
 
 def begin(directory, **options):
@@ -64,7 +82,7 @@ def test_new_states_of_a_running_episode_are_served(tmp_path):
         told = ask(view, "/episodes")
         first, second = told["episodes"]
         assert (first["label"], first["length"]) == ("0", STEPS)
-        assert (second["label"], "length" in second) == ("1", False)
+        assert (second["label"], second["running"]) == ("1", True)
         assert len(told["returns"]) == told["count"] == 1
         motion = ask(view, "/motion", episode=second["name"])
         assert (motion["steps"], motion["chunk"]["count"]) == (1, 2)
@@ -88,6 +106,82 @@ def test_an_evaluation_is_shown_as_one(tmp_path):
     assert [each["label"] for each in listed["episodes"]] == ["0.s0 0", "0.s1 0"]
     assert newest.startswith("Hopper-v5/seed-001/")
     assert (listed["count"], motion["steps"]) == (2, STEPS)
+
+
+def test_episodes_of_other_sizes_are_other_scenes(tmp_path):
+    """A page shows the shapes of its episode, so it cannot show those of another."""
+    with begin(tmp_path) as run:
+        for radius in (0.05, 0.2):
+            run.unwrapped.model.geom_size[2, 0] = radius
+            run.reset(seed=1)
+            for _ in range(STEPS):
+                run.step(np.zeros(3))
+    with served(tmp_path) as view:
+        names = [each["name"] for each in ask(view, "/episodes")["episodes"]]
+        first, same, other = (
+            ask(view, "/motion", episode=name)["scene"] for name in names
+        )
+    assert first == same != other
+
+
+def test_a_tendon_that_begins_to_wrap_gets_its_segments(tmp_path):
+    """The page is loaded again with them when they appear, and then kept."""
+    (tmp_path / "model.xml").write_text(WRAPPING)
+    options = ["--out", str(tmp_path / "run"), "--max-steps", "60", "--workers", "0"]
+    assert main(["record", str(tmp_path / "model.xml"), *options]) == 0
+
+    def page():
+        text = urllib.request.urlopen(view.url).read().decode()
+        data = json.loads(text.split('id="replay-data">')[1].split("</script>")[0])
+        segments = [name for name in data["nodes"] if name.startswith("/tendon/")]
+        return data["scene"], len(segments)
+
+    with served(tmp_path / "run") as view:
+        [episode] = ask(view, "/episodes")["episodes"]
+        first, one = page()
+        asked = [ask(view, "/motion", episode=episode["name"]) for _ in range(2)]
+        then, several = page()
+    assert one == 1 < several
+    assert first != then == asked[0]["scene"] == asked[1]["scene"]
+
+
+def test_an_episode_that_a_kill_cut_is_not_called_running(tmp_path):
+    """Only an open monitor has running episodes."""
+    # A copy of an open run is what a kill leaves: nobody holds its lock.
+    with begin(tmp_path / "open") as run:
+        run.reset(seed=1)
+        run.step(np.zeros(3))
+        shutil.copytree(tmp_path / "open", tmp_path / "killed")
+    with served(tmp_path / "killed") as view:
+        _, cut = ask(view, "/episodes")["episodes"]
+        assert cut["running"] is False
+        motion = ask(view, "/motion", episode=cut["name"])
+    assert motion["ending"] == "End of the recording"
+
+
+def test_states_that_are_not_finite_are_left_out(tmp_path, monkeypatch):
+    """The page goes on after them, at the state that it is told."""
+
+    def load(path, **options):
+        trajectory = mjrec.load_trajectory(path, **options)
+        trajectory.states[STEPS] = np.nan
+        return trajectory
+
+    monkeypatch.setattr("mjrec.viewing.live.load_trajectory", load)
+    begin(tmp_path).close()
+    with served(tmp_path) as view:
+        [episode] = ask(view, "/episodes")["episodes"]
+        told = ask(view, "/motion", episode=episode["name"])
+        assert (told["chunk"]["count"], told["next"]) == (STEPS, STEPS + 1)
+        then = {"episode": episode["name"], "from": STEPS}
+        assert "chunk" not in ask(view, "/motion", **then)
+
+
+@pytest.mark.parametrize("port", [-1, 65536])
+def test_a_port_that_does_not_exist_is_refused(port, tmp_path):
+    """The error says which ports there are."""
+    with pytest.raises(InvalidArgument, match="from 0 to 65535"):
+        LiveView(tmp_path, port=port)
 
 
 def test_a_view_that_never_served_can_be_closed(tmp_path):

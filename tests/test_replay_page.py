@@ -18,6 +18,7 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.commands import main
+from mjrec.errors import UnreadableFile
 
 pytest.importorskip("viser")
 pytest.importorskip("mjviser")
@@ -29,10 +30,11 @@ from mjrec.viewing.motion import Shape
 _STEPS = 12
 # Meshes, skins, height fields, tendons, mocap bodies; hundreds of geoms.
 _ENVIRONMENTS = (
+    *("FetchReach-v4", "dm_control/ball_in_cup-catch"),
     *("Humanoid-v5", "Ant-v5", "Pusher-v5", "FetchPickAndPlace-v4"),
     *("AdroitHandDoor-v1", "HandManipulateBlock-v1"),
     *("dm_control/dog-run", "dm_control/quadruped-escape"),
-    *("dm_control/ball_in_cup-catch", "dm_control/fish-swim"),
+    "dm_control/fish-swim",
 )
 
 # All shapes that are not geoms of one size: tendons around a cylinder, a cloth.
@@ -62,6 +64,18 @@ _ROPE = """
     <geom type="sphere" size=".1"/>
     <flexcomp name="rope" type="grid" dim="1" count="4 1 1" spacing=".1 .1 .1"
       pos="0 0 1" radius=".01" mass=".1"/>
+  </worldbody>
+</mujoco>
+"""
+
+# A hand that is moved from outside comes first, as in Fetch.
+_PICKER = """
+<mujoco>
+  <worldbody>
+    <body name="hand" mocap="true" pos="9 0 0"><geom size=".1"/></body>
+    <body pos="0 0 1">
+      <body name="arm"><joint axis="0 1 0"/><geom size=".2" pos=".5 0 0"/></body>
+    </body>
   </worldbody>
 </mujoco>
 """
@@ -198,6 +212,12 @@ def data_at(trajectory, step):
     return data
 
 
+def data_in(page):
+    """Return what a page's script reads."""
+    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
+    return json.loads(text)
+
+
 def check_geoms(page, data):
     """Check that the page has the geoms that MuJoCo draws, where MuJoCo has them."""
     page.wait_for_timeout(500)
@@ -225,9 +245,12 @@ def check_geoms(page, data):
 
 
 @pytest.mark.browser
-@parametrize("name", _ENVIRONMENTS, default=0, part=pytest.mark.environments)
+@parametrize("name", _ENVIRONMENTS, default=2, part=pytest.mark.environments)
 def test_all_kinds_of_scenes_stand_where_mujoco_has_them(name, pages, tmp_path):
-    """So do meshes, skins, height fields, and bodies that the simulation moves."""
+    """So do meshes, skins, height fields, and bodies that the simulation moves.
+
+    A browser draws each without a GPU, which takes more than five seconds.
+    """
     with robots_that_reset():
         if "/" not in name and name not in gymnasium.registry:
             pytest.skip("Gymnasium-Robotics is not installed")
@@ -258,13 +281,32 @@ def test_keys_go_through_the_states(page, cheetah):
     page.keyboard.press("End")
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
-    data = data_at(trajectory, _STEPS)
-    check_geoms(page, data)
-    # The model's cameras can be chosen, and move as they do in the videos.
+    check_geoms(page, data_at(trajectory, _STEPS))
+
+
+@pytest.mark.browser
+def test_a_camera_of_the_model_is_kept_from_step_to_step(page, cheetah):
+    """It moves as in the videos, also if it has the name of one of the page's."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    page.keyboard.press("End")
     page.select_option("#replay-camera", label="track")
-    position, fovy = page.evaluate(_CAMERA)
-    assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
-    assert fovy == pytest.approx(data.model.cam_fovy[0])
+    for step in (_STEPS, _STEPS - 1):
+        data = data_at(trajectory, step)
+        position, fovy = page.evaluate(_CAMERA)
+        assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
+        assert fovy == pytest.approx(data.model.cam_fovy[0])
+        assert f"#step={step}&camera=0&" in page.evaluate("location.hash")
+        page.keyboard.press(",")
+    page.select_option("#replay-camera", label="tracking")
+
+
+@pytest.mark.browser
+def test_speeds_end_at_the_slowest_and_the_fastest(page):
+    """Keys beyond the ends change nothing."""
+    for key, speed in (("]", "4"), ("[", "0.1")):
+        for _ in range(8):
+            page.keyboard.press(key)
+        assert page.input_value("#replay-speed") == speed
 
 
 @pytest.mark.browser
@@ -340,6 +382,36 @@ def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
 
 
 @pytest.mark.browser
+def test_a_chosen_episode_is_shown_with_its_shapes_and_its_name(pages, tmp_path):
+    """Also if the page is loaded again for other shapes: it does not jump back."""
+    env = gymnasium.make("Hopper-v5", max_episode_steps=2)
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=0) as run:
+        for radius in (0.05, 0.2):
+            run.unwrapped.model.geom_size[2, 0] = radius
+            run.reset(seed=0)
+            run.step(np.zeros(3))
+            run.step(np.zeros(3))
+    with LiveView(tmp_path) as view:
+        thread = threading.Thread(target=view.serve)
+        thread.start()
+        try:
+            page = pages(view.url)
+            for number, width in ((1, 0.4), (0, 0.1)):
+                page.click(f"#live-episodes li:has-text('{number}: 2 steps')")
+                title = f"Hopper-v5, episode {number}"
+                page.wait_for_function("(said) => document.title === said", arg=title)
+                page.wait_for_selector("html[data-replay=ready]", state="attached")
+                page.wait_for_selector("#live-episodes [aria-pressed=true]")
+                assert f"{title}: recorded" in page.inner_text("#replay")
+                shown = np.reshape(page.evaluate(_VERTICES, "/geom/2"), (-1, 3))
+                assert np.ptp(shown, axis=0).min() == pytest.approx(width, rel=0.1)
+                assert page.inner_text("#live-count") == "Complete episodes: 2"
+        finally:
+            view.close()
+            thread.join()
+
+
+@pytest.mark.browser
 @pytest.mark.thorough
 def test_tendons_and_cloth_move(pages, tmp_path):
     """What changes its shape has the vertices and the segments that MuJoCo computes."""
@@ -402,6 +474,7 @@ def test_what_cannot_be_shown_is_left_out(cheetah, tmp_path):
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
+    assert made.notes == ("States left out because they are not finite: 1 of 13.",)
     assert "<script>alert" not in made.path.read_text()
 
 
@@ -416,11 +489,51 @@ def test_colours_change_when_the_model_does(tmp_path):
     path = record("Hopper-v5", tmp_path, 4, change)
     page = tmp_path / "page.html"
     mjrec.write_replay(mjrec.load_trajectory(path), page)
-    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
-    colours = {each[1]: each for each in json.loads(text)["chunk"]["colours"]}
+    colours = {each[1]: each for each in data_in(page)["chunk"]["colours"]}
     assert colours["/geom/2"] == [3, "/geom/2", [1, 0, 0, 1]]
     assert colours["/geom/3"][0] == 3
     assert colours["/geom/3"][2][3] == 0
+
+
+def test_the_view_follows_what_joints_move(tmp_path):
+    """It is the first tree with a joint, not a mocap body that comes before it."""
+    trajectory = recorded_model(_PICKER, tmp_path, steps=2)
+    page = mjrec.write_replay(trajectory, tmp_path / "page.html").path
+    centre = data_at(trajectory, 0).body("arm").subtree_com
+    assert data_in(page)["start"] == pytest.approx(centre)
+
+
+def test_what_appears_later_is_there_hidden(tmp_path):
+    """A geom that the first state does not show is part of the page."""
+
+    def change(env, step):
+        env.unwrapped.model.geom_rgba[2] = (1, 0, 0, step > 2)
+
+    trajectory = mjrec.load_trajectory(record("Hopper-v5", tmp_path, 4, change))
+    trajectory.states[0] = np.nan
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
+    assert made.notes == ("States left out because they are not finite: 1 of 5.",)
+    data = data_in(tmp_path / "page.html")
+    assert data["rgba"]["/geom/2"][3] == 0
+    assert data["chunk"]["colours"] == [[2, "/geom/2", [1, 0, 0, 1]]]
+
+
+@pytest.mark.parametrize(
+    ("field", "kind"),
+    [("geom_size", "Sizes and meshes"), ("mat_texrepeat", "Textures")],
+)
+def test_changes_that_are_not_shown_are_named(field, kind, tmp_path, caplog):
+    """Shapes and their images stay as at the reset; the page and the log say so."""
+
+    def change(env, step):
+        if step == 2:
+            getattr(env.unwrapped.model, field)[:] *= 2
+
+    path = record("Hopper-v5", tmp_path, 4, change)
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    assert made.notes == (f"{kind} change during the episode but not on this page.",)
+    assert made.notes[0] in caplog.text
+    assert f"<p>{made.notes[0]}</p>" in made.path.read_text()
 
 
 def test_sides_have_the_whole_texture_and_normals(tmp_path):
@@ -434,6 +547,14 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
     assert b"NORMAL" in mesh.export(file_type="glb")
     top = mesh.vertex_normals[:, 2] > 0.9
     assert np.ptp(mesh.visual.uv[top], axis=0) == pytest.approx([1, 1])
+
+
+def test_an_episode_without_finite_states_is_refused(cheetah, tmp_path):
+    """The error names the file and says why there is nothing to show."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    trajectory.states[:] = np.nan
+    with pytest.raises(UnreadableFile, match="none of the states to show is finite"):
+        mjrec.write_replay(trajectory, tmp_path / "page.html")
 
 
 def test_the_page_says_what_it_does_not_show(tmp_path, caplog):

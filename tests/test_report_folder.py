@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import mjrec
+from mjrec.commands import main
 from mjrec.commands.report import report
 from mjrec.errors import DirectoryNotWritable, InvalidArgument
 from mjrec.reporting.gathering import gather
@@ -219,12 +220,15 @@ def test_a_single_file_has_as_much_in_it_as_is_allowed(recordings, tmp_path):
 
 
 def test_replays_stand_beside_the_videos(tmp_path):
-    """With `replays` the best, median and worst episode have a page in 3D each."""
+    """With `--replay` the best, median and worst episode have a page in 3D each."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
     always = {"video_callable": lambda _: True}
     record(env, tmp_path / "run", 4, height=48, width=64, **always)
-    page = write_report(tmp_path / "run", tmp_path / "report", replays=True)
+    page = tmp_path / "report/index.html"
+    assert (
+        main(["report", str(tmp_path / "run"), "--replay", "-o", str(page.parent)]) == 0
+    )
     links = re.findall(r'href="\./(replays/[^"]+)"', page.read_text())
     assert len(set(links)) == 3
     assert all("replay-data" in (page.parent / each).read_text() for each in links)

@@ -25,15 +25,22 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from ..errors import Error, InvalidArgument
-from ..formats.monitor_directory import episode_of, infix_of, recording_directories
+from ..formats.locks import is_locked
+from ..formats.monitor_directory import (
+    episode_of,
+    infix_of,
+    lock_name,
+    recording_directories,
+)
 from ..results import iter_episodes
 from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
 from .geometry import linear
-from .motion import Stage
-from .replay import ending_of, motion_chunk, replay_page
+from .motion import FIXED_FIELDS, Shape, Stage
+from .replay import are_finite, ending_of, motion_chunk, replay_page, title_of
 
 _ADDRESS = "127.0.0.1"
+_MOST_PORTS = 65_535
 _NICENESS = 10
 # Limits of one response; a page requests the rest later.
 _MOST_STATES = 500
@@ -47,7 +54,13 @@ class _Shown:
 
     path: Path
     stage: Stage
+    scene: str
     next: int = 0
+
+    @property
+    def scene_id(self) -> str:
+        """An id shared by all episodes that the same page can show."""
+        return _digest(self.scene, *self.stage.passing)
 
 
 class LiveView:
@@ -81,10 +94,18 @@ class LiveView:
         path = Path(directory)
         if not path.is_dir():
             raise InvalidArgument(f"The directory {path} does not exist.")
+        if not 0 <= port <= _MOST_PORTS:
+            raise InvalidArgument(
+                f"Port {port} does not exist. Choose one from 0 to {_MOST_PORTS}; 0 is "
+                "any free port."
+            )
         self._token = secrets.token_urlsafe(24)
         self._directory = path
         self._trust_models = trust_models
         self._shown: _Shown | None = None
+        # A page needs a node for whatever appears in any state, such as each segment
+        # of a tendon, so all stages of a scene share what has been seen.
+        self._passing: dict[str, dict[str, Shape]] = {}
         # Only one thread at a time may use MuJoCo's objects.
         self._lock = threading.Lock()
         try:
@@ -178,14 +199,14 @@ class LiveView:
             if not known:
                 raise InvalidArgument("No episode has been recorded yet.")
             path = path or [*known.values()][-1]
-            trajectory, stage = self._load(path)
+            trajectory, shown = self._load(path)
         except Error as error:
             # An episode that has just begun has no state yet.
             return _WAITING.format(html.escape(str(error)))
-        motion = stage.motion(trajectory, np.arange(1))
-        scene = _scene_id(trajectory, stage)
+        motion = shown.stage.motion(trajectory, np.arange(1))
+        scene = shown.scene_id
         live = {"live": True, "episode": self._name(path), "scene": scene}
-        return replay_page(trajectory, stage, motion, additions=live)
+        return replay_page(trajectory, shown.stage, motion, additions=live)
 
     def _episodes(self) -> dict[str, Any]:
         ended = {}
@@ -204,27 +225,33 @@ class LiveView:
             entry: dict[str, Any] = {"name": self._name(path), "label": label}
             if (over := ended.get(path)) is not None:
                 entry |= {"length": over.length, "return": _number(over.reward)}
+            else:
+                entry["running"] = _is_running(path)
             listed.append(entry)
         stride = max(1, -(-len(returns) // _MOST_POINTS))
         curve = [_number(each) for each in returns[::stride]]
         return {"episodes": listed, "count": len(returns), "returns": curve}
 
     def _motion(self, name: str, first: int) -> dict[str, Any]:
-        trajectory, stage = self._load(self._known()[name], first)
+        trajectory, shown = self._load(self._known()[name], first)
         last = min(len(trajectory.states), first + _MOST_STATES)
+        is_going_on = not trajectory.complete and _is_running(trajectory.path)
         told: dict[str, Any] = {
-            "scene": _scene_id(trajectory, stage),
             "steps": len(trajectory),
+            "next": max(first, last),
             "hasMore": last < len(trajectory.states),
-            "ending": ending_of(trajectory) if trajectory.complete else "",
-            "rgba": {s.name: linear(s.rgba) for s in stage.shapes},
+            "title": title_of(trajectory),
+            "ending": "" if is_going_on else ending_of(trajectory),
+            "rgba": {s.name: linear(s.rgba) for s in shown.stage.shapes},
         }
-        if first < last and self._shown is not None:
-            self._shown.next = last
-            motion = stage.motion(trajectory, np.arange(first, last))
+        shown.next = max(first, last)
+        steps = np.arange(first, last)
+        steps = steps[are_finite(trajectory.states[first:last])]
+        if len(steps):
+            motion = shown.stage.motion(trajectory, steps)
             told["start"] = motion.target[0].tolist()
             told["chunk"] = motion_chunk(motion, keep_all=True)
-        return told
+        return {**told, "scene": shown.scene_id}
 
     def _name(self, path: Path) -> str:
         return str(path.relative_to(self._directory))
@@ -232,15 +259,20 @@ class LiveView:
     def _known(self) -> dict[str, Path]:
         return {self._name(path): path for path in recorded_episodes(self._directory)}
 
-    def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, Stage]:
+    def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, _Shown]:
         """Return a trajectory, and a stage for its states starting at `first`."""
         trajectory, shown = load_trajectory(path, trust_models=self._trust_models), None
         if self._shown is not None and self._shown.path == path:
             # A stage can only move forward through the states.
             shown = self._shown if 0 < self._shown.next <= first else None
-        self._shown = shown or _Shown(path, Stage(trajectory))
-        self._shown.next = first + 1
-        return trajectory, self._shown.stage
+        if shown is None:
+            stage = Stage(trajectory)
+            scene = _scene(trajectory, stage)
+            stage.passing = self._passing.setdefault(scene, stage.passing)
+            shown = _Shown(path, stage, scene)
+        shown.next = first + 1
+        self._shown = shown
+        return trajectory, shown
 
 
 def be_nice() -> None:
@@ -248,11 +280,24 @@ def be_nice() -> None:
     os.nice(_NICENESS)
 
 
-def _scene_id(trajectory: Trajectory, stage: Stage) -> str:
-    """Return an id shared by all episodes that the same page can show."""
+def _scene(trajectory: Trajectory, stage: Stage) -> str:
+    """Return an id of what a new stage shows in all states of its episode."""
     shapes = [(s.name, s.geom_type) for s in (*stage.shapes, *stage.soft)]
-    parts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
-    return hashlib.sha256(parts.encode()).hexdigest()[:16]
+    facts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
+    sizes = (getattr(stage.model, name).tobytes() for name in FIXED_FIELDS)
+    return _digest(facts, *sizes)
+
+
+def _digest(*parts: str | bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part if isinstance(part, bytes) else part.encode())
+    return digest.hexdigest()[:16]
+
+
+def _is_running(path: Path) -> bool:
+    """Return whether the monitor that records an unfinished episode is still open."""
+    return is_locked(path.parent / lock_name(infix_of(path.name) or ""))
 
 
 def _number(value: float) -> float | None:

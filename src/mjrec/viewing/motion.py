@@ -7,8 +7,10 @@ the same groups, tendons and sites are hidden as in the environment's videos.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnreadableFile
-from ..formats.trajectory import TrajectoryReader
+from ..formats.trajectory import ModelChange, TrajectoryReader
 from ..simulation.cameras import check_camera, default_camera, resolve_camera
 from ..simulation.fields import apply_fields
 from ..simulation.foreign_files import open_vetted_trajectory
@@ -29,6 +31,15 @@ _DECOR = int(mujoco.mjtCatBit.mjCAT_DECOR)
 _GEOM, _SITE = int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_SITE)
 _TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
 _SKIN, _FLEX = int(mujoco.mjtGeom.mjGEOM_SKIN), int(mujoco.mjtGeom.mjGEOM_FLEX)
+# Fields whose changes a page does not show.
+_FIXED = {
+    "Sizes and meshes": (
+        *("geom_size", "geom_type", "geom_dataid", "site_size"),
+        *("mesh_vert", "hfield_data", "hfield_size"),
+    ),
+    "Textures": ("tex_data", "mat_texid", "mat_texrepeat", "geom_matid"),
+}
+FIXED_FIELDS = tuple(name for names in _FIXED.values() for name in names)
 
 
 @dataclass(frozen=True)
@@ -94,11 +105,12 @@ class Stage:
 
     Args:
         trajectory: the trajectory with the model and the options to draw it with.
+        first: index of the first state to show.
 
     Attributes:
         model: the model, as in the last requested state.
         data: the model's data, as in the last requested state.
-        shapes: shapes that are drawn in all states, in MuJoCo's order.
+        shapes: shapes of constant size that are drawn in some state.
         passing: shapes seen in only some states, with a different size in each, such as
             tendons.
         soft: skins and flexible bodies.
@@ -110,7 +122,7 @@ class Stage:
         UnreadableFile, UntrustedModel: see `Trajectory.model`.
     """
 
-    def __init__(self, trajectory: Trajectory) -> None:
+    def __init__(self, trajectory: Trajectory, *, first: int = 0) -> None:
         self.model = trajectory.model()
         self.data = mujoco.MjData(self.model)
         self.passing: dict[str, Shape] = {}
@@ -119,13 +131,16 @@ class Stage:
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MOST_GEOMS)
         self._changes_seen = 0
         with open_vetted_trajectory(trajectory.path) as reader:
-            # This is for the camera and the options; the model's fields are set.
-            self._change_model(reader, 0)
-        self._enter(trajectory, 0)
-        drawn = list(self._drawn())
-        self.view = self._view()
-        self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
-        self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+            # Up to the reset, this is for the camera and the options only.
+            self._change_model(reader, first)
+            self._enter(trajectory, first)
+            drawn = list(self._drawn())
+            if self._scene.ngeom > len(drawn):
+                self.notes.append("Labels, contacts and other marks are not shown.")
+            self.view = self._view()
+            self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
+            self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+            self.shapes += self._hidden_at_first(reader)
         self._names, self._moving = self._moving_objects()
         self._rgba = {shape.name: shape.rgba for shape in self.shapes}
         self._has_passing = self.model.ntendon > 0 or any(
@@ -138,8 +153,6 @@ class Stage:
         if len(shown) < len(self.soft):
             self.soft = shown
             self.notes.append("One-dimensional flexible bodies are not shown.")
-        if self._scene.ngeom > len(drawn):
-            self.notes.append("Labels, contacts and other marks are not shown.")
         self._tracked = _tracked_body(self.model)
 
     @property
@@ -261,13 +274,45 @@ class Stage:
             change = reader.read_change(self._changes_seen)
             if change.step > step:
                 break
-            try:
-                view = {"camera": self._camera, "option": self._option}
-                apply_fields(self.model, change.fields, **view)
-            except InvalidArgument as error:
-                raise UnreadableFile(reader.path, error) from error
+            self._note(change.fields)
+            self._apply(reader.path, change)
             self._changes_seen += 1
         return self._changes_seen > before
+
+    def _apply(self, path: Path, change: ModelChange) -> None:
+        try:
+            view = {"camera": self._camera, "option": self._option}
+            apply_fields(self.model, change.fields, **view)
+        except InvalidArgument as error:
+            raise UnreadableFile(path, error) from error
+
+    def _note(self, fields: Mapping[str, NDArray[Any]]) -> None:
+        for kind, names in _FIXED.items():
+            note = f"{kind} change during the episode but not on this page."
+            if note not in self.notes and any(
+                not np.array_equal(getattr(self.model, name), fields[name])
+                for name in names
+                if name in fields
+            ):
+                self.notes.append(note)
+
+    def _hidden_at_first(self, reader: TrajectoryReader) -> list[Shape]:
+        """Return what is drawn only after later changes, as transparent shapes."""
+        if self._changes_seen == reader.change_count:
+            return []
+        known = {_name(geom) for geom in self._drawn()}
+        now = self.model, self._camera, self._option
+        self.model, self._camera, self._option = map(copy.copy, now)
+        found: dict[str, Shape] = {}
+        for number in range(self._changes_seen, reader.change_count):
+            self._apply(reader.path, reader.read_change(number))
+            for geom in self._drawn():
+                if _is_fixed_size(geom) and _name(geom) not in known:
+                    shape = _shape(geom)
+                    hidden = (*shape.rgba[:3], 0.0)
+                    found.setdefault(shape.name, replace(shape, rgba=hidden))
+        self.model, self._camera, self._option = now
+        return list(found.values())
 
     def _new_colours(
         self, trajectory: Trajectory, step: int, index: int
@@ -357,6 +402,13 @@ def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _tracked_body(model: mujoco.MjModel) -> int:
-    """Return the root of the first moving body's tree; the world if nothing moves."""
-    moving = np.flatnonzero(model.body_weldid != 0)
-    return int(model.body_rootid[moving[0]]) if len(moving) else 0
+    """Return the root of the tree that the first joint moves; the world without joints.
+
+    Mocap bodies do not count: they may jump, or be far away.
+    """
+    if model.njnt == 0:
+        return 0
+    body = int(model.jnt_bodyid[0])
+    while model.body_weldid[parent := int(model.body_parentid[body])] != 0:
+        body = parent
+    return body

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_files import write_text
+from ..errors import UnreadableFile
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.trajectories import Trajectory
 from .geometry import linear, scene_page
@@ -76,12 +77,22 @@ def write_replay(
     Raises:
         InvalidArgument: `max_fps` is not a valid rate.
         MissingDependency: viser or mjviser is not installed.
-        UnreadableFile: the file is damaged, or was recorded without a simulation.
+        UnreadableFile: the file is damaged, was recorded without a simulation, or has
+            no finite state.
         UntrustedModel: see `Trajectory.model`.
         FileNotWritten: the disk is full.
     """
-    stage = Stage(trajectory)
-    motion = stage.motion(trajectory, shown_steps(trajectory, max_fps))
+    steps = shown_steps(trajectory, max_fps)
+    if not len(steps):
+        reason = "none of the states to show is finite"
+        raise UnreadableFile(trajectory.path, reason)
+    stage = Stage(trajectory, first=int(steps[0]))
+    motion = stage.motion(trajectory, steps)
+    if left := int((~are_finite(trajectory.states)).sum()):
+        stage.notes.append(
+            "States left out because they are not finite: "
+            f"{left} of {len(trajectory.states)}."
+        )
     for note in stage.notes:
         _LOG.warning("%s: %s", trajectory.path.name, note)
     page = replay_page(trajectory, stage, motion)
@@ -109,7 +120,12 @@ def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int
     steps = np.arange(0, count, stride)
     if count and steps[-1] != count - 1:
         steps = np.append(steps, count - 1)
-    return steps[np.isfinite(trajectory.states[steps]).all(axis=1)]
+    return steps[are_finite(trajectory.states[steps])]
+
+
+def are_finite(states: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which states contain only finite numbers."""
+    return np.asarray(np.isfinite(states).all(axis=1))
 
 
 def replay_page(
@@ -137,8 +153,7 @@ def replay_page(
     )
     notes = "".join(f"<p>{html.escape(note)}</p>" for note in about["notes"])
     options = "".join(
-        f'<option value="{number}" data-name="{html.escape(camera["name"])}">'
-        f"{html.escape(camera['name'])}</option>"
+        f'<option value="{number}">{html.escape(camera["name"])}</option>'
         for number, camera in enumerate(about["cameras"])
     )
     controls = _file("replay.html").format(
@@ -223,7 +238,7 @@ def _skin(stage: Stage, skin: int) -> dict[str, Any]:
 
 
 def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, Any]:
-    model, episode = stage.model, trajectory.episode_id
+    model = stage.model
     position, target, fovy = stage.view
     cameras = [
         {"name": model.camera(i).name or str(i), "fovy": float(model.cam_fovy[i])}
@@ -231,12 +246,12 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
     ]
     number = stage.camera_number
     return {
-        "title": f"{trajectory.env_id or 'Recording'}, episode {episode}",
+        "title": title_of(trajectory),
         "steps": len(trajectory),
         "ending": ending_of(trajectory),
         "hasRewards": bool(len(trajectory.rewards)),
         "cameras": cameras,
-        "camera": "track" if number is None else cameras[number]["name"],
+        "camera": "track" if number is None else str(number),
         "extent": float(model.stat.extent),
         "view": {"position": position, "target": target, "fovy": fovy},
         "start": motion.target[0].tolist(),
@@ -253,6 +268,11 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
         "notes": stage.notes,
         "chunk": motion_chunk(motion),
     }
+
+
+def title_of(trajectory: Trajectory) -> str:
+    """Return the title of an episode's page."""
+    return f"{trajectory.env_id or 'Recording'}, episode {trajectory.episode_id}"
 
 
 def ending_of(trajectory: Trajectory) -> str:

@@ -4,7 +4,8 @@
   const about = JSON.parse(document.getElementById("replay-data").textContent);
   if (!about.live) return;
   const element = (id) => document.getElementById(id);
-  const token = new URLSearchParams(location.search).get("token");
+  const asked = new URLSearchParams(location.search);
+  const token = asked.get("token");
   const replay = () => window.mjrecReplay;
   let episode = about.episode, wanted = episode, known = 0, hasMore = false, returns = [];
 
@@ -24,26 +25,30 @@
     }
     const told = await ask("/motion", { episode, from: known });
     if (told.scene !== about.scene) {
-      location.search = new URLSearchParams({ token, episode });
+      // The scene makes the address another one, so that the page is loaded again.
+      const follow = element("live-follow").checked;
+      location.search = new URLSearchParams({ token, episode, follow, scene: told.scene });
       return;
     }
     if (known === 0) replay().begin(told);
     if (told.chunk) await replay().append(told.chunk);
-    known += told.chunk?.count ?? 0;
+    known = told.next;
     hasMore = told.hasMore;
-    replay().tell(told.steps, told.ending);
+    replay().tell(told);
     if (told.chunk) replay().newest(element("live-follow").checked);
   }
 
   async function list() {
     const told = await ask("/episodes");
     returns = told.returns;
-    element("live-count").textContent = `${told.count} episodes have ended`;
+    const cut = told.episodes.filter((each) => each.running === false).length;
+    const early = cut ? `; ended early: ${cut}` : "";
+    element("live-count").textContent = `Complete episodes: ${told.count}${early}`;
     const rows = told.episodes.toReversed().map((each) => {
       const button = document.createElement("button");
       button.type = "button";
-      button.textContent = each.length === undefined
-        ? `${each.label}: running`
+      button.textContent = "running" in each
+        ? `${each.label}: ${each.running ? "running" : "ended early"}`
         : `${each.label}: ${each.length} steps, return ${each.return?.toPrecision(5) ?? "NaN"}`;
       button.setAttribute("aria-pressed", each.name === episode);
       button.addEventListener("click", () => {
@@ -96,6 +101,7 @@
   }
 
   element("live").hidden = false;
+  element("live-follow").checked = asked.get("follow") !== "false";
   forever(motion, 300);
   forever(list, 1000);
 })();

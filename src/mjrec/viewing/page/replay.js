@@ -136,6 +136,9 @@
       part.material.color.setRGB(rgba[0], rgba[1], rgba[2]);
       part.material.opacity = rgba[3];
       part.material.transparent = rgba[3] < 1;
+      part.material.depthWrite = rgba[3] === 1;
+      // Opaque materials are compiled without opacity.
+      part.material.needsUpdate = true;
       shown.set(name, rgba);
     });
   }
@@ -299,7 +302,7 @@
   function keep() {
     const place = new URLSearchParams({
       step: frames[current].step,
-      camera: element("replay-camera").selectedOptions[0].dataset.name,
+      camera: element("replay-camera").value,
       speed: element("replay-speed").value,
     });
     if (location.hash.slice(1) !== place.toString()) location.replace(`#${place}`);
@@ -309,22 +312,25 @@
     const place = new URLSearchParams(location.hash.slice(1));
     if (place.has("speed")) element("replay-speed").value = place.get("speed");
     if (!element("replay-speed").value) element("replay-speed").value = "1";
-    const options = [...element("replay-camera").options];
-    const wanted = place.get("camera") ?? about.camera;
-    const option = options.find((each) => each.dataset.name === wanted);
     const step = Number(place.get("step") ?? 0);
     let state = frames.findLastIndex((frame) => frame.step <= step);
     if (state < 0) state = 0;
     current = state;
-    chooseCamera(option ? option.value : "free");
+    chooseCamera(place.get("camera") ?? about.camera);
   }
 
   // --- Keys --------------------------------------------------------------------
 
-  const cycle = (id, by) => {
-    const select = element(id);
-    const next = (select.selectedIndex + by + select.length) % select.length;
-    return select.options[next].value;
+  const changeSpeed = (by) => {
+    const select = element("replay-speed");
+    const next = select.selectedIndex + by;
+    select.selectedIndex = Math.max(0, Math.min(select.length - 1, next));
+    keep();
+  };
+  const nextCamera = () => {
+    const { options, selectedIndex } = element("replay-camera");
+    chooseCamera(options[(selectedIndex + 1) % options.length].value);
+    keep();
   };
   const keys = {
     " ": () => play(!playing),
@@ -332,9 +338,9 @@
     ".": () => go(current + 1),
     Home: () => go(0),
     End: () => go(frames.length - 1),
-    "[": () => { element("replay-speed").value = cycle("replay-speed", -1); keep(); },
-    "]": () => { element("replay-speed").value = cycle("replay-speed", 1); keep(); },
-    c: () => { chooseCamera(cycle("replay-camera", 1)); keep(); },
+    "[": () => changeSpeed(-1),
+    "]": () => changeSpeed(1),
+    c: nextCamera,
     "?": () => { element("replay-keys").hidden = !element("replay-keys").hidden; },
     Escape: () => { element("replay-keys").hidden = true; },
   };
@@ -382,9 +388,11 @@
     followed = null;
   }
 
-  function tell(steps, ending) {
+  function tell({ steps, ending, title }) {
     about.steps = steps;
     about.ending = ending;
+    document.title = title;
+    element("replay-title").textContent = title;
   }
 
   function newest(isWanted) {
