@@ -161,8 +161,11 @@ def slurm_job():
 
 
 def test_jobs_are_done_in_slurm_jobs(tmp_path):
-    """Which are submitted as one array, and have completed at the end."""
-    with Run(SlurmEngine(3), work(tmp_path)) as run:
+    """Which are submitted as one array, and have completed at the end.
+
+    So they do when they take a moment more than their work does.
+    """
+    with Run(SlurmEngine(3, setup=["trap 'sleep 1' EXIT"]), work(tmp_path)) as run:
         for number in range(50):
             run.submit(str(number), do="where")
         found = [outcome for outcome in run.results() if outcome is not None]
