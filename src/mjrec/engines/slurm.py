@@ -38,6 +38,7 @@ from ..atomic_files import write_text
 from ..child_python import changed_environ
 from ..errors import ClosedError, Error, InvalidArgument, UnknownName
 from ..machine import usable_cpus
+from ..plain_text import counted
 from .gpu_shares import GpuShare, check_worker_count, engine_package
 from .local import LocalEngine
 from .worker import do_job, end_idle_children
@@ -336,8 +337,8 @@ class SlurmEngine(Executor):
             if {state for state, _ in states.values()} == {"PENDING"}:
                 reasons = {reason for _, reason in states.values() if reason}
                 logger.warning(
-                    "%d Slurm jobs have been waiting for a minute. Slurm's reason: %s.",
-                    len(states),
+                    "Slurm has not started %s for a minute. Its reason: %s.",
+                    counted(len(states), "Slurm job"),
                     ", ".join(sorted(reasons)) or "none",
                 )
 
