@@ -69,7 +69,8 @@ ONE_VIDEO = {"videos": 1, "frames": 3, "size": 32, "workers": 1}
 # How little is measured, how many numbers there are or what each is called, and what is
 # promised of them.
 MEASURED = {
-    "engines": ({"workers": (2,), "jobs": 20}, 3, ()),
+    "engines": ({"engines": ("local",), "workers": (2,), "jobs": 20}, 3, ("≤ 5",)),
+    "starting": ({}, ["mjrec --help", "mjrec list"], ("≤ 0.4", "≤ 0.5")),
     "stepping": (
         {**CHEETAH, **SHORT, "steps": 30, "drawn_steps": 2},
         *(6, ("≥ 0.95", "≥ 0.8")),
