@@ -31,7 +31,7 @@ from .tables import table_of
 # of them import mujoco.
 MEASUREMENTS = (
     *("stepping", "time_to_video", "memory", "rendering", "disk", "encoding"),
-    *("verifying", "evaluating", "reporting", "scaling", "engines"),
+    *("verifying", "evaluating", "reporting", "scaling", "engines", "starting"),
 )
 
 

@@ -21,6 +21,7 @@ from engine_runs import (
 from parts import parametrize
 
 import mjrec
+from mjrec.engines.choice import engine_from
 from mjrec.engines.jobs import JobOutcome, Run
 from mjrec.errors import Error, InvalidArgument
 
@@ -80,6 +81,14 @@ def test_jobs_get_settings_and_arguments(begin, engine, tmp_path, monkeypatch):
     assert seen == ["0", "1", "2", "3"]
     arguments = {"do": "echo", "text": "ß\n"}
     assert value == {"arguments": arguments, "settings": {"seeds": [1, 2]}}
+
+
+def test_a_dask_scheduler_that_does_not_answer(monkeypatch):
+    """The error says so soon, and what to do."""
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("mjrec.engines.choice._SECONDS_TO_REACH", 0.1)
+    with pytest.raises(Error, match=r"answers at tcp://127.0.0.1:1. `dask scheduler`"):
+        engine_from("dask:tcp://127.0.0.1:1")
 
 
 @on_each

@@ -57,6 +57,19 @@ def test_a_killed_worker_of_ray_counts_as_a_death(tmp_path, caplog):
     assert "job a, which will be retried" in caplog.text
 
 
+@pytest.mark.thorough
+def test_cancelling_does_not_wait_for_the_resources_of_others(tmp_path):
+    """Whose task holds the only CPU, and goes on; in the queue is nothing left."""
+    with own_ray(cpus=1) as ray:
+        os.mkfifo(tmp_path / "pipe")
+        other = ray.remote(num_cpus=1)(Path.read_text).remote(tmp_path / "pipe")
+        with Run(RayEngine(), odd_work(shared=tmp_path / "shared")) as run:
+            submit(run, "a", "b", do="echo")
+            assert next(run.results(timeout_s=0.5)) is None
+        (tmp_path / "pipe").write_text("of the caller")
+        assert ray.get(other) == "of the caller"
+
+
 BEGIN = """
 import os, signal, sys
 from pathlib import Path

@@ -12,7 +12,7 @@ import sys
 import time
 
 import pytest
-from engine_runs import driver, lines, odd_work, submit, wait_for
+from engine_runs import driver, lines, odd_work, submit, values, wait_for
 from waiting import wait_until
 
 from mjrec.engines.jobs import WORK_FOLDER, Run
@@ -161,8 +161,11 @@ def slurm_job():
 
 
 def test_jobs_are_done_in_slurm_jobs(tmp_path):
-    """Which are submitted as one array, and have completed at the end."""
-    with Run(SlurmEngine(3), work(tmp_path)) as run:
+    """Which are submitted as one array, and have completed at the end.
+
+    So they do when they take a moment more than their work does.
+    """
+    with Run(SlurmEngine(3, setup=["trap 'sleep 1' EXIT"]), work(tmp_path)) as run:
         for number in range(50):
             run.submit(str(number), do="where")
         found = [outcome for outcome in run.results() if outcome is not None]
@@ -196,6 +199,27 @@ def test_a_slurm_job_that_is_ended(tmp_path, how, caplog):
         )
     assert "No Slurm job" not in caplog.text
     assert lines(tmp_path / "left")
+
+
+@pytest.mark.parametrize("how", ["requeued", "notice"])
+def test_a_slurm_job_that_is_put_back_into_the_queue(tmp_path, how):
+    """It does its work once more, under its number, in a new process.
+
+    Takes two minutes, for which Slurm holds such a job back.
+    """
+    go = tmp_path / "go"
+    with Run(SlurmEngine(1), work(tmp_path)) as run:
+        submit(run, "a", do="hold", begun=str(tmp_path / "begun"), go=str(go))
+        first = wait_for(tmp_path / "begun", run)
+        number = slurm_job()
+        options = ("scancel", "--signal=USR2", "--full")
+        asked(*(options if how == "notice" else ("scontrol", "requeue")), number)
+        wait_until(lambda: len(lines(tmp_path / "begun")) == 2, seconds=200)
+        assert slurm_job() == number
+        go.touch()
+        [value] = values(run)
+    assert [str(first), str(value["pid"])] == lines(tmp_path / "begun")
+    assert lines(tmp_path / "left")[0] == str(first)
 
 
 def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(tmp_path, monkeypatch):

@@ -109,6 +109,25 @@ def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path):
             outcomes(run)
 
 
+def test_slurm_jobs_that_are_not_started(tmp_path, monkeypatch, caplog):
+    """Their number is told, and Slurm's reason."""
+    cancelled = tmp_path / "cancelled"
+    for name, does in {
+        "sbatch": "echo Submitted batch job 7",
+        "squeue": f"test -e {cancelled} || echo '7|PENDING|Resources'",
+        "scancel": f"touch {cancelled}",
+        "srun": "false",
+    }.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o700)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.setattr("mjrec.engines.slurm._SECONDS_WITHOUT_START", -1)
+    with Run(SlurmEngine(1), odd_work(shared=tmp_path / "shared")) as run:
+        submit(run, "a", do="echo")
+        wait_until(lambda: caplog.text)
+    assert "not started 1 Slurm job for a minute. Its reason: Resources." in caplog.text
+
+
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_in_a_terminal(tmp_path):
     """It reaches all processes there; the driver ends those that are Slurm's."""

@@ -14,6 +14,7 @@ from .ray import RayEngine
 from .slurm import SlurmEngine, slurm_options
 
 _DASK = "dask:"
+_SECONDS_TO_REACH = 10.0
 ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
 
 
@@ -107,7 +108,9 @@ def _dask(address: str) -> Executor:
         "distributed", f"{_DASK}{address}", install="dask[distributed]"
     )
     try:
-        client = distributed.Client(address, set_as_default=False)
+        client = distributed.Client(
+            address, set_as_default=False, timeout=_SECONDS_TO_REACH
+        )
     except (OSError, ValueError) as error:
         raise Error(
             f"No Dask scheduler answers at {address}. `dask scheduler` starts one and "

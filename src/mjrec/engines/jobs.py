@@ -190,7 +190,8 @@ class Run:
         self._tasks.clear()
         self._parked.clear()
         try:
-            # This is for Slurm, whose jobs outlive their futures.
+            # This is for Slurm, whose jobs outlive their futures, and for Ray, whose
+            # tasks may wait for others' resources.
             if end_run := getattr(self._engine, "end_run", None):
                 end_run(str(self._place))
             wait(running)

@@ -72,7 +72,8 @@ class RayEngine(Executor):
         self._task: Any = None
         self._disconnect: weakref.finalize[Any, Any] | None = None
         self._is_shut_down = False
-        self._running = 0
+        # The arguments of the calls that Ray has, keyed by their object reference.
+        self._calls: dict[Any, tuple[Any, ...]] = {}
         self._waiting: collections.deque[tuple[Future[Any], Any]] = collections.deque()
         self._one_at_a_time = threading.RLock()
 
@@ -100,6 +101,13 @@ class RayEngine(Executor):
         self._waiting.append((future, (fn, args, kwargs)))
         self._begin()
         return future
+
+    def end_run(self, place: str) -> None:
+        """Cancel a run's calls that no Ray worker has begun. Idempotent."""
+        with self._one_at_a_time:
+            of_run = [ref for ref, args in self._calls.items() if place in args]
+        for ref in of_run:
+            self._ray.cancel(ref)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Accept no more calls, and close the engine's own connection. Idempotent."""
@@ -129,18 +137,18 @@ class RayEngine(Executor):
 
     def _begin(self) -> None:
         with self._one_at_a_time:
-            while self._waiting and self._running < (self.workers or float("inf")):
+            while self._waiting and len(self._calls) < (self.workers or float("inf")):
                 future, call = self._waiting.popleft()
                 if future.set_running_or_notify_cancel():
-                    self._running += 1
-                    theirs = self._task.remote(mjrec.__version__, *call).future()
-                    theirs.add_done_callback(
-                        lambda done, to=future: self._end(done, to)
+                    ref = self._task.remote(mjrec.__version__, *call)
+                    self._calls[ref] = call[1]
+                    ref.future().add_done_callback(
+                        lambda done, ref=ref, to=future: self._end(done, ref, to)
                     )
 
-    def _end(self, done: Future[Any], future: Future[Any]) -> None:
+    def _end(self, done: Future[Any], ref: Any, future: Future[Any]) -> None:
         with self._one_at_a_time:
-            self._running -= 1
+            del self._calls[ref]
         error = done.exception()
         if error is None:
             future.set_result(done.result())
@@ -161,7 +169,13 @@ def _call(
             f"The driver has mjrec {version}, but a Ray worker has "
             f"{mjrec.__version__}. Install the same version on all machines."
         )
-    return fn(*args, **kwargs)
+    # `ray.cancel` would interrupt a call that has begun. A job that has begun ends with
+    # its run.
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        return fn(*args, **kwargs)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _disconnect(ray: Any) -> None:

@@ -38,6 +38,7 @@ from ..atomic_files import write_text
 from ..child_python import changed_environ
 from ..errors import ClosedError, Error, InvalidArgument, UnknownName
 from ..machine import usable_cpus
+from ..plain_text import counted
 from .gpu_shares import GpuShare, check_worker_count, engine_package
 from .local import LocalEngine
 from .worker import do_job, end_idle_children
@@ -57,6 +58,7 @@ _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_QUESTIONS = 10.0
 _SECONDS_FOR_COMMAND = 60.0
 _SECONDS_WITHOUT_START = 60.0
+_SECONDS_TO_COMPLETE = 5.0
 _SECONDS_TO_END = 15.0
 _END_OF_LOG = 2000
 _NOT_OVER = frozenset(
@@ -216,23 +218,37 @@ class SlurmEngine(Executor):
         return task.future
 
     def end_run(self, place: str) -> None:
-        """Cancel the Slurm jobs of a run, and wait until they end. Idempotent."""
+        """End the Slurm jobs of a run, and wait until they have ended. Idempotent.
+
+        A Slurm job that has unfinished work is canceled at once. The others have a few
+        seconds to complete.
+        """
         with self._one_at_a_time:
             self._waiting = [t for t in self._waiting if t.place.parent != Path(place)]
             elements = self._elements.items()
-            of_run = [j for j, of in elements if of[0].place.parent == Path(place)]
-            ending = {*of_run}
-            if ending and self._cluster == "slurm":
-                _command("scancel", "--quiet", *sorted(job.job_id for job in ending))
-            deadline = time.monotonic() + _SECONDS_TO_END
-            # If Slurm does not answer, the deadline ends the wait. Local processes exit
-            # on their own.
-            while ending and time.monotonic() < deadline:
-                states = self._states(ending)
-                ending -= {job for job in states if states[job][0] not in _NOT_OVER}
-                time.sleep(_SECONDS_BETWEEN_LOOKS)
+            of_run = {j: of for j, of in elements if of[0].place.parent == Path(place)}
+            finished = {j for j, of in of_run.items() if all(map(_is_finished, of))}
+            self._cancel(of_run.keys() - finished)
+            self._cancel(self._unended(finished, _SECONDS_TO_COMPLETE))
+            self._unended(of_run, _SECONDS_TO_END)
             for job in of_run:
                 del self._elements[job]
+
+    def _cancel(self, jobs: Collection[Any]) -> None:
+        # Local processes exit on their own.
+        if jobs and self._cluster == "slurm":
+            _command("scancel", "--quiet", *sorted(job.job_id for job in jobs))
+
+    def _unended(self, jobs: Collection[Any], seconds: float) -> set[Any]:
+        """Wait until jobs have ended, and return those that have not ended in time."""
+        running = {*jobs}
+        deadline = time.monotonic() + seconds
+        # If Slurm does not answer, the deadline ends the wait.
+        while running and time.monotonic() < deadline:
+            states = self._states(running)
+            running -= {job for job in states if states[job][0] not in _NOT_OVER}
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+        return running
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Accept no more jobs. Idempotent."""
@@ -321,8 +337,8 @@ class SlurmEngine(Executor):
             if {state for state, _ in states.values()} == {"PENDING"}:
                 reasons = {reason for _, reason in states.values() if reason}
                 logger.warning(
-                    "%d Slurm jobs have been waiting for a minute. Slurm's reason: %s.",
-                    len(states),
+                    "Slurm has not started %s for a minute. Its reason: %s.",
+                    counted(len(states), "Slurm job"),
                     ", ".join(sorted(reasons)) or "none",
                 )
 
@@ -438,6 +454,10 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
 
 # Parameters that have separate command-line options.
 _ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
+
+
+def _is_finished(task: _Task) -> bool:
+    return task.future.done() and not task.future.cancelled()
 
 
 def _resolve(task: _Task, answer: Any) -> None:
