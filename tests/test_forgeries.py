@@ -6,6 +6,7 @@ hashes of files and frames, metadata, the table, the crate and the bag.
 """
 
 import dataclasses
+import gzip
 import json
 import re
 import shutil
@@ -555,6 +556,42 @@ def in_hdf5(edit):
     return lie
 
 
+def hide_in_hdf5(run):
+    """Leave the bytes of a dataset that is there no more."""
+    text = np.frombuffer(b"All goals were reached. " * 20, np.uint8)
+    in_hdf5(lambda file: file.create_dataset("note", data=text))(run)
+    in_hdf5(lambda file: file.pop("note"))(run)
+
+
+def add_to_the_end(run):
+    with run.trajectory(1).open("ab") as file:
+        file.write(b"All goals were reached. " * 20)
+
+
+def add_to_a_chunk(run):
+    """After the compressed data, where HDF5 does not look."""
+
+    def edit(file):
+        rewards = file["rewards"].id
+        skipped, content = rewards.read_direct_chunk((0,))
+        rewards.write_direct_chunk((0,), content + b"All succeeded.", skipped)
+
+    in_hdf5(edit)(run)
+
+
+def name_in_gzip(run):
+    """Name the file from which a compiled model was packed."""
+    path = run.the("*.mjb.gz")
+    content = gzip.decompress(path.read_bytes())
+    with path.open("wb") as file, gzip.GzipFile("succeeds", "wb", 9, file, 0) as model:
+        model.write(content)
+
+
+def add_a_gzip_stream(run):
+    with run.the("*.mjb.gz").open("ab") as file:
+        file.write(gzip.compress(b"", mtime=0))
+
+
 def add_to(pattern):
     return methodcaller("edit_json", pattern, success_rate=1)
 
@@ -895,6 +932,20 @@ EDITED = {
         both(CLAIMS["another MuJoCo"], lambda run: run.the("*.mjb.gz").unlink()),
         "mjb.gz",
     ),
+    # Bytes that only a search of the file finds, beside a claim without a lie.
+    **{
+        f"{what}, with another {claim} claimed": (
+            both(CLAIMS[f"another {claim}"], lie),
+            line,
+        )
+        for what, lie, claim, line in (
+            ("text after a trajectory", add_to_the_end, "Gymnasium", "space outside"),
+            ("a dataset deleted", hide_in_hdf5, "Gymnasium", "space outside"),
+            ("text in a chunk", add_to_a_chunk, "Gymnasium", "space outside"),
+            ("a name in a model's file", name_in_gzip, "machine", "gzip header"),
+            ("a stream after a model", add_a_gzip_stream, "machine", "gzip stream"),
+        )
+    },
     # Additions.
     "a dataset added": (
         in_hdf5(lambda file: file.create_dataset("success", data=np.ones(3))),

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from ..errors import Error, UnreadableFile
+from ..errors import Error, FileNotWritten, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import read_object
 from ..formats.monitor_directory import episode_of
@@ -250,6 +250,8 @@ class Comparison:
                 found = (each for each in found if each.topic is Topic.REWARDS)
             for each in found:
                 yield replace(each, file=file)
+        except FileNotWritten:
+            raise
         except Error as error:
             yield _damaged(file, error)
         if _ending(file) == ".meta.json" and self._level is Level.PIXELS:

@@ -8,7 +8,6 @@ contains its hash, which depends on the version of MuJoCo that compiled it.
 from __future__ import annotations
 
 import contextlib
-import gzip
 import hashlib
 import re
 import zipfile
@@ -24,6 +23,7 @@ from ..formats.monitor_directory import infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
 from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same
 from .findings import Topic
+from .hidden_bytes import unpacked_model
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
@@ -91,13 +91,7 @@ def compare_sources(given: Path, made: Path, _: object) -> Iterator[Same | Diffe
 
 def compare_models(given: Path, made: Path, _: object) -> Iterator[Same | Difference]:
     """Compare two compiled models whose bytes differ."""
-    contents = []
-    for path in (given, made):
-        try:
-            with gzip.open(path) as model:
-                contents.append(model.read(_LARGEST_MODEL))
-        except (OSError, EOFError, zlib.error) as error:
-            raise UnreadableFile(path, error) from error
+    contents = [unpacked_model(path) for path in (given, made)]
     if contents[0][:_MODEL_HEAD] == contents[1][:_MODEL_HEAD]:
         # The header contains the version of MuJoCo that wrote the model.
         yield Same(Topic.IDENTITY, unit="compiled model")

@@ -22,6 +22,7 @@ from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
 from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same, differs, unlike
 from .findings import Topic
+from .hidden_bytes import hidden_in_trajectory
 
 _Key: TypeAlias = tuple[Topic, Aspect]
 
@@ -60,6 +61,7 @@ def compare_trajectories(
 
     Raises:
         UnreadableFile: a trajectory is damaged.
+        FileNotWritten: the disk is full.
     """
     differs = False
     try:
@@ -71,7 +73,9 @@ def compare_trajectories(
                 yield found
     except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
         raise UnreadableFile(given, error) from error
-    if not differs:
+    hidden = [*hidden_in_trajectory(given)]
+    yield from hidden
+    if not differs and not hidden:
         yield STORED_DIFFERENTLY
 
 
