@@ -60,6 +60,8 @@ def test_what_cannot_be_set_is_refused(name, value, words):
         ("option.label", -1),
         ("option.frame", 0.5),
         ("option.frame", 1 << 30),
+        ("label", ["side"]),
+        ("label", "x" * 10_000),
     ],
 )
 def test_facts_that_cannot_be_are_refused_by_name(name, value):

@@ -80,6 +80,20 @@ def test_recorded_episodes_leave_nothing(workers, tmp_path):
     assert len(list(tmp_path.glob("*.mp4"))) == (EPISODES // 200 if workers else 0)
 
 
+def test_episodes_that_are_dropped_hold_no_tail(tmp_path):
+    """Also before the garbage collector runs."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
+    monitor = Monitor(env, tmp_path, keep="worst:3", workers=0)
+    gc.disable()
+    try:
+        run(monitor, 20)
+        maps = Path("/proc/self/maps").read_text()
+        assert len(set(re.findall(r"\S+\.tail", maps))) <= 4
+    finally:
+        gc.enable()
+        monitor.close(wait=False)
+
+
 # Takes more than five seconds: an encoder for each episode.
 @pytest.mark.usefixtures("no_process_is_left")
 @parametrize("count", [60, EPISODES])

@@ -106,7 +106,8 @@ class RayEngine(Executor):
         """Cancel a run's calls that no Ray worker has begun. Idempotent."""
         with self._one_at_a_time:
             of_run = [ref for ref, args in self._calls.items() if place in args]
-        for ref in of_run:
+        # Otherwise `cancel` would start a new Ray.
+        for ref in of_run if self._ray.is_initialized() else ():
             self._ray.cancel(ref)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

@@ -292,6 +292,8 @@ class StateRecorder:
         Raises:
             FileNotWritten: the disk is full.
         """
+        # The fast path keeps the log's memory alive.
+        self._fast = None
         if self._span is not None:
             self._span.drop()
 

@@ -22,6 +22,7 @@ from .fields import apply_fields, empty_model, member_names, read_member
 _MOST_GEOMS = 1 << 20
 # OpenGL's own limits are lower.
 _LARGEST = 1 << 16
+_LONGEST_LABEL = 1000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,13 +80,18 @@ def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
             )
         fields.update({f"{what}.{name}": np.asarray(values[name]) for name in names})
     apply_fields(empty_model(), fields, **structs)
+    label = facts.get("label")
+    if not isinstance(label, str | int | Mapping) or len(str(label)) > _LONGEST_LABEL:
+        raise InvalidArgument(
+            f"A label must be a camera's name, number or pose, not {label!r:.50}..."
+        )
     return SceneView(
         **structs,
         max_geom=_whole(facts, "max_geom", most=_MOST_GEOMS),
         fresh=facts.get("fresh") is True,
         height=_whole(facts, "height"),
         width=_whole(facts, "width"),
-        label=facts.get("label"),
+        label=label,
     )
 
 
