@@ -270,13 +270,13 @@ def swap_the_ending(run):
 # Lies about videos.
 
 
-def change_pixel(run, episode, frame=-1):
+def paint_a_spot(run, episode, frame=-1):
     frames = [one.copy() for one in run.frames(episode)]
-    frames[frame][20, 10] ^= 64
+    frames[frame][12:15, 12:15] = 0
     run.film(episode, frames)
 
 
-one_pixel = partial(change_pixel, episode=1, frame=2)
+one_spot = partial(paint_a_spot, episode=1, frame=2)
 
 
 def negative(run, episode=1, **said):
@@ -286,6 +286,14 @@ def negative(run, episode=1, **said):
 def refilm(change):
     """Film frames of what `change` makes of those of the second episode."""
     return lambda run: run.film(1, change(run.frames(1)))
+
+
+def all_of_a_video(run):
+    """A spot in each of its frames."""
+    frames = [one.copy() for one in run.frames(1)]
+    for one in frames:
+        one[12:15, 12:15] = 0
+    run.film(1, frames)
 
 
 hide_the_fall = refilm(lambda frames: frames[:-2])
@@ -719,6 +727,11 @@ claim_gpu = methodcaller(
 )
 
 
+claim_llvmpipe = methodcaller(
+    "edit_json", "*.meta.json", gl_renderer="llvmpipe (LLVM 1.0.0, 256 bits)"
+)
+
+
 def claim_ffmpeg(run):
     def edit(said):
         said["encoder_version"]["version"] = "ffmpeg version 7.1"
@@ -822,7 +835,7 @@ QUICK = {
     *("rewards doubled", "rewards doubled by a wrapper that is not named"),
     "rewards doubled, with a version of the environment claimed",
     *("an action edited", "an action edited, with a wrapper claimed"),
-    *("last states called unknown", "one pixel changed", "a body made invisible"),
+    *("last states called unknown", "a spot painted", "a body made invisible"),
     *("a second track on top", "the best called the worst", "arguments hidden"),
     "an end cut off without a fault",
     *("another name", "a dataset added", "a note beside the data"),
@@ -871,18 +884,27 @@ EDITED = {
     "the first left out": (leave_the_first_out, "begins with episode 1"),
     "fall called a limit of time": (swap_the_ending, "terminated|truncated"),
     # Videos.
-    "one pixel changed": (one_pixel, "frame 2"),
+    "a spot painted": (one_spot, "frame 2"),
     **{
-        f"one pixel changed, with {name} claimed": both(one_pixel, claim)
+        f"a spot painted, with {name} claimed": both(one_spot, claim)
         for name, claim in CLAIMS.items()
     },
     "a pixel of each video changed, with another ffmpeg claimed": (
-        both(each(2, change_pixel), claim_ffmpeg),
+        both(each(2, paint_a_spot), claim_ffmpeg),
         "hash",
     ),
     "a frame rate 3 percent off, as the metadata says": (
         methodcaller("film", 1, fps="97/4", playback_speed=0.97),
         "fps",
+    ),
+    # The frames that nobody touched show that it is the same build.
+    "a spot painted, with another build of llvmpipe claimed": (
+        both(one_spot, claim_llvmpipe),
+        "7 frames of recording 0.u are equal bit for bit",
+    ),
+    "a spot in all frames of a video, with another build of llvmpipe claimed": (
+        both(all_of_a_video, claim_llvmpipe),
+        "frames of recording 0.u are equal bit for bit",
     ),
     "the fall not shown": (hide_the_fall, "frames"),
     "a frame doubled": (double_a_frame, "frames"),
