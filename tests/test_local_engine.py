@@ -34,7 +34,7 @@ WRONG = [
     *(({"workers": number}, "workers must be a whole number") for number in (0, True)),
     *(({"gpus": each}, r"such as 1, or 0\.25") for each in (-1, float("nan"), "1")),
     ({"gpus": 1.5}, r"cannot be 1\.5"),
-    ({"require_gpu": True}, "give each worker a share"),
+    ({"require_gpu": True}, "Give each worker a share"),
 ]
 
 

@@ -188,7 +188,9 @@ def test_sources_of_another_model_are_not_stored(directory, other):
     facts = stored(directory, model, authored)
     assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
     assert content_of(load_model(directory, facts)) == content_of(model)
-    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, but this is"):
+    with pytest.raises(
+        UnreadableFile, match=r"requires mujoco 3\.1\.4, but the installed"
+    ):
         load_model(directory, {**facts, **OTHER_VERSION})
 
 

@@ -279,7 +279,7 @@ def test_what_a_policy_raises_is_named(write):
     assert isinstance(e.value.__cause__, KeyError)
     with pytest.raises(mjrec.PolicyError, match=r"in call.*line 4"):
         policy(None)
-    with pytest.raises(mjrec.PolicyError, match=r"Building .*Early.*in init"):
+    with pytest.raises(mjrec.PolicyError, match=r"Creating .*Early.*in init"):
         load("Early")
     with pytest.raises(mjrec.PolicyError, match=r"Alone.* Give it a parameter"):
         load("Alone")

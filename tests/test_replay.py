@@ -122,7 +122,7 @@ def test_a_state_comes_back_by_the_names_of_its_parts():
     [
         ({"act": None}, "act has 0, not 1 as in this model"),
         ({"qpos": slice(0, 9)}, "qpos has 9, not 8 as in this model"),
-        ({"aura": slice(0, 1)}, r"aura, which MuJoCo .* not know"),
+        ({"aura": slice(0, 1)}, r"aura, which MuJoCo .* lacks"),
     ],
 )
 def test_a_state_of_another_model_is_refused_whole(change, said):
