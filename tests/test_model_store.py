@@ -188,9 +188,7 @@ def test_sources_of_another_model_are_not_stored(directory, other):
     facts = stored(directory, model, authored)
     assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
     assert content_of(load_model(directory, facts)) == content_of(model)
-    with pytest.raises(
-        UnreadableFile, match=r"requires mujoco 3\.1\.4, but"
-    ):
+    with pytest.raises(UnreadableFile, match=r"requires mujoco 3\.1\.4, but"):
         load_model(directory, {**facts, **OTHER_VERSION})
 
 
