@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes, each of which runs an mjrec module that creates a `Parent`.
+"""Child processes that each run an mjrec module, which creates a `Parent`.
 
 multiprocessing is not used. Its children import the caller's main module (so a script
 without a `__main__` guard runs twice) and cannot be started from daemonic processes.

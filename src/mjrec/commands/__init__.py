@@ -99,7 +99,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
-    """Return the arguments, the first of which is a command.
+    """Return the arguments, beginning with a command.
 
     Raises:
         SystemExit: the command is unknown or missing, its arguments are missing, or

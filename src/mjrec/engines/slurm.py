@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each of which does some jobs of a run.
+"""An engine for Slurm: arrays of Slurm jobs that each do some jobs of a run.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
 on the survival of a single Slurm job. A Slurm job that is requeued does only its

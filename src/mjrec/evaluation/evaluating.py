@@ -58,7 +58,7 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
-# For `max_fps`, of which None is a value.
+# The default of `max_fps`, for which None is a value.
 NOT_GIVEN: Any = object()
 _DEFAULTS: Mapping[str, Any] = {
     "episodes": 10,

@@ -63,7 +63,7 @@ def _parse(payload: bytes) -> list[_Node]:
     """Return the pickled object, then the calls whose results are not used."""
     stack: list[_Node] = []
     below_marks: list[list[_Node]] = []
-    memo: list[_Node] = []
+    memo: dict[Any, _Node] = {}
     calls: list[_Node] = []
     for opcode, value, _ in pickletools.genops(payload):
         name, needs = opcode.name, opcode.stack_before
@@ -73,9 +73,8 @@ def _parse(payload: bytes) -> list[_Node]:
             below_marks.append(stack)
             stack = []
         elif name == "MEMOIZE":
-            memo.append(stack[-1])
+            memo[len(memo)] = stack[-1]
         elif name in ("BINGET", "LONG_BINGET"):
-            assert value is not None
             stack.append(memo[value])
         elif name == "POP":
             calls.append(stack.pop())
@@ -84,7 +83,8 @@ def _parse(payload: bytes) -> list[_Node]:
                 parts, stack = stack, below_marks.pop()
             else:
                 first = len(stack) - len(needs) + (name in _CHANGES)
-                parts, stack = stack[first:], stack[:first]
+                parts = stack[first:]
+                del stack[first:]
             if name == "BUILD" and _is_empty_dict(parts[0]):
                 # Some objects get their `__dict__` only when it is first read.
                 continue

@@ -23,13 +23,12 @@ from ..formats.monitor_directory import infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
 from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same
 from .findings import Topic
-from .hidden_bytes import unpacked_model
+from .hidden_bytes import LARGEST_MODEL, unpacked_model
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers, the last of which is the version. No real model reaches 1 GiB.
+# Four numbers. The last one is the version.
 _MODEL_HEAD: Final = 16
-_LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"
 # In the zip file of the sources.
 _CONTENTS: Final = "contents.json"
@@ -109,7 +108,7 @@ def _sources(path: Path) -> str:
     digest = hashlib.sha256()
     try:
         with open_plain_zip(path) as sources:
-            if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
+            if sum(each.file_size for each in sources.infolist()) > LARGEST_MODEL:
                 raise ValueError("its sources are too large")
             contents = json_object(sources.read(_CONTENTS))
             main = f"source/{contents.get('main')}"

@@ -27,7 +27,8 @@ _MOST_EXPANSION: Final = 1032
 # Before HDF5 2.0, the header of each group holds four times, as this flag says.
 _WITH_TIMES: Final = 0x20
 _TIMES_SIZE: Final = 16
-_LARGEST_MODEL: Final = 1 << 30
+# No real model reaches 1 GiB.
+LARGEST_MODEL: Final = 1 << 30
 
 
 def hidden_in_trajectory(path: Path) -> Iterator[Difference]:
@@ -97,7 +98,7 @@ def unpacked_model(path: Path) -> bytes:
         if any(content[3:8]):
             raise ValueError("its gzip header has a name, a comment, a time or more")
         try:
-            model = stream.decompress(content, _LARGEST_MODEL)
+            model = stream.decompress(content, LARGEST_MODEL)
         except zlib.error as error:
             raise ValueError(error) from error
         if not stream.eof or stream.unused_data:
