@@ -35,7 +35,7 @@ XML = """
         ("geom_matid", np.array([np.nan]), "whole numbers"),
         ("vis.quality.shadowsize", np.array(np.nan), "whole numbers"),
         ("vis.quality.shadowsize", np.array(2**40), "cannot be 1099511627776"),
-        ("option.label", np.array(1 << 30), "must be from 0 to"),
+        ("option.label", np.array(1 << 30), "must be between 0 and"),
     ],
 )
 def test_what_cannot_be_set_is_refused(name, value, words):

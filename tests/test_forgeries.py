@@ -988,7 +988,7 @@ EDITED = {
     "a key of the provenance": (add_to_facts("provenance"), "success_rate"),
     "a key of the machine": (add_to_facts("machine"), "success_rate"),
     "a line in the journal": (add_a_line, "remark"),
-    "a fault that no recorder has": (add_a_fault, "fault of 'result'"),
+    "a fault that no recorder has": (add_a_fault, "unknown kind of fault: 'result'"),
     "a key in a line of the journal": (add_to_a_line, "judged"),
 }
 

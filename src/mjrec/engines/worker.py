@@ -174,7 +174,7 @@ class _JobChild(Child):
         return {"died": died, "begun": self._is_ready, "log": log}
 
     def end(self) -> None:
-        """End the child and the processes that it started. Idempotent."""
+        """Terminate the child and any processes that it started. Idempotent."""
         super().end()
         # Processes left behind by the child may keep the pipe open.
         self._listener.join(_SECONDS_BETWEEN_LOOKS)

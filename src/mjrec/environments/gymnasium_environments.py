@@ -184,7 +184,7 @@ def _spec(env_id: str) -> registration.EnvSpec:
 
 @contextlib.contextmanager
 def _failures_of(env_id: str) -> Iterator[None]:
-    """Convert exceptions in third-party code to our errors."""
+    """Convert exceptions raised by third-party code to our own errors."""
     try:
         yield
     except Error:

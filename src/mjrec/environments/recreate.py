@@ -230,7 +230,7 @@ def checked_options(options: Any) -> dict[str, Any] | None:
         return None
     if not isinstance(options, Mapping) or not _are_plain(options):
         raise NotRecreated(
-            f"the options of a reset ({options!r:.100}) are not plain values"
+            f"the reset options ({options!r:.100}) contain more than plain values"
         )
     return dict(options)
 

@@ -6,12 +6,12 @@ for any number of workers, no matter how often the evaluation was killed and res
 
     task,seed,episode,return,length,terminated,truncated,success,failure
 
-Truth values are `true`, `false` or, if unknown, empty. Numbers are written with
-Python's `repr`, so reading them yields exactly the same values. The text of a failure
-is a single line.
+Booleans are written as `true` or `false`, or left empty if unknown. Numbers are written
+with Python's `repr`, so reading them yields exactly the same values. The text of a
+failure is a single line.
 
-`timing.csv` contains the facts that differ between runs: wall-clock times and the files
-of each episode. It has one row for each row of `results.csv`, in the same order::
+`timing.csv` contains the values that differ between runs: wall-clock times and the
+files of each episode. It has one row for each row of `results.csv`, in the same order::
 
     task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 

@@ -110,7 +110,7 @@ class Difference(Place):
     """One place, or several similar ones, where the two runs differ.
 
     Attributes:
-        aspect: how the item differs.
+        aspect: the kind of difference.
         where: the place in the file: "states[12].qpos", "frame 13", "mjrec.schedule".
         how: the difference as a short, printable clause (see `unlike`).
         size: the largest `abs(x - y) / (1 + abs(x))` for numbers. None if the

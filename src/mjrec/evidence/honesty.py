@@ -162,7 +162,7 @@ def _faults(recording: RecordingInputs) -> Iterator[Finding]:
 
 
 def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Finding]:
-    """Yield the episodes of each evaluation seed that are missing.
+    """Yield a finding for each evaluation seed that has missing episodes.
 
     Episodes are numbered from 0, across all recordings of an environment.
     """

@@ -215,7 +215,7 @@ class RecordingInputs:
         return f"recording {self.infix}"
 
     def item(self, episode: EpisodeInputs) -> str:
-        """Return an episode's name in findings."""
+        """Return the name that findings use for an episode."""
         return f"episode {episode.episode_id} of {self.infix}"
 
 

@@ -237,7 +237,7 @@ def _events(journal: _Journal) -> dict[str, Any]:
                 found["kept"] = [*map(count, numbers)]
             case "fault", {"episode_id": int() | None, "what": what, "reason": str()}:
                 if what not in get_args(What):
-                    raise ValueError(f"no recorder has a fault of {what!r:.80}")
+                    raise ValueError(f"unknown kind of fault: {what!r:.80}")
                 found["faults"].append([before, _known(facts, _FAULT)])
             case "recovered", _:
                 found["was_killed"] = True

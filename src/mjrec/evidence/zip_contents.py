@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a zip file's stated content before anything is unpacked.
+"""Checks on a zip file's declared contents, made before anything is unpacked.
 
 Only plain archives are accepted: files and folders below one folder, one after another
-from the first byte to the table of contents, which ends the file. Some programs see
-anything else in the file (a comment, bytes before, between or after entries, two
-entries over the same bytes) and others do not, so two readers could check different
-content.
+from the first byte to the table of contents, which ends the file. Anything else in the
+file (a comment, bytes before, between or after entries, two entries over the same
+bytes) is visible to some programs but not to others, so two readers could end up
+checking different content.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _place_of_table(file: BinaryIO) -> int:
 
 
 def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
-    """Return the table's size and offset, its entries, and where it must end."""
+    """Return the table's size, offset and number of entries, and where it must end."""
     if size < _END.size:
         raise ValueError("it is not a zip file")
     file.seek(size - _END.size)

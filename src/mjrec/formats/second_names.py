@@ -74,7 +74,7 @@ def take_second_names(video: Path) -> None:
 
 
 def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield each file of an episode that has a second name, with the second path."""
+    """Yield each file of an episode that has a second name, and the second path."""
     second = _said_of(video)
     if second is None:
         return

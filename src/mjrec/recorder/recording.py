@@ -174,7 +174,7 @@ class EpisodeRecording:
         """Keep the video of an episode that was chosen after its end.
 
         Args:
-            selection: the facts about the choice.
+            selection: why and how the episode was chosen.
 
         Raises:
             FileNotWritten: the disk is too full to record the choice. The recording is

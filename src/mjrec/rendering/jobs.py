@@ -135,7 +135,7 @@ def plain_camera(camera: Any) -> PlainCamera:
 
 def _plain_member(name: str, value: Any) -> Any:
     if name not in CAMERA_MEMBERS:
-        raise UnknownName("member of mujoco.MjvCamera", name, CAMERA_MEMBERS)
+        raise UnknownName("mujoco.MjvCamera member", name, CAMERA_MEMBERS)
     try:
         numbers = np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -289,7 +289,7 @@ class RenderedVideos:
 
     @classmethod
     def joined(cls, parts: Iterable[Self], directory: Path) -> Self:
-        """Combine several results, in which each path occurs only once.
+        """Combine several results. No path may occur in more than one of them.
 
         Args:
             parts: the results.

@@ -241,7 +241,7 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
             )
     if field in _KINDS and value.item() not in range(_KINDS[field]):
         raise InvalidArgument(
-            f"The field {field} must be from 0 to {_KINDS[field] - 1} in MuJoCo "
+            f"The field {field} must be between 0 and {_KINDS[field] - 1} in MuJoCo "
             f"{mujoco.__version__}, but it is {value}."
         )
     if isinstance(present, np.ndarray):
