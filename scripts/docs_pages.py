@@ -183,7 +183,7 @@ def gl_page() -> str:
     lines = [
         "# OpenGL errors",
         "",
-        "`mjrec doctor` explains these, and so does `mjrec.gl.diagnose(text)`.",
+        "`mjrec doctor` and `mjrec.gl.diagnose(text)` explain these messages.",
         "",
     ]
     # Messages with the same cause and fix are grouped.
@@ -201,17 +201,17 @@ def gl_page() -> str:
     lines += [
         "**It hangs**",
         "",
-        "A process that had drawn was forked (`AsyncVectorEnv` without "
-        '`context="spawn"`), or the driver hangs. Spawn instead; use fewer processes '
-        "for each GPU.",
+        "A process was forked after it had rendered (`AsyncVectorEnv` without "
+        '`context="spawn"`), or the driver hangs. Use spawn instead, and fewer '
+        "processes per GPU.",
         "",
         "**Black frames**",
         "",
-        "They were drawn on another thread than the one that made the context.",
+        "They were rendered on a thread other than the one that created the context.",
         "",
-        "**Slow in spite of a GPU**",
+        "**Slow despite a GPU**",
         "",
-        "llvmpipe, on the CPU, answers instead of the GPU's driver. See "
+        "llvmpipe renders on the CPU instead of the GPU's driver. See "
         "[Choose a GPU](../howto/headless.md#choose-a-gpu).",
     ]
     return "\n".join(lines) + "\n"
