@@ -47,7 +47,7 @@ _SHARP = 0.6  # radians between faces that make an edge
 _GAMMA = 2.2
 _AMBIENT = 0.8
 # Directions and intensities of lights without shadows, beside viser's own from above.
-_SIDE_LIGHTS = (((0.4, -1.0, 0.4), 1.4), ((-0.6, 0.8, 0.3), 0.6))
+_SIDE_LIGHTS = (((1.0, -0.7, 0.5), 1.2), ((-0.7, 1.0, 0.4), 0.6))
 _TRANSPARENT = 0.999
 
 # For each side of a cube texture, in OpenGL's order: the axis that points at it, and
@@ -94,13 +94,10 @@ def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
             mesh_of(model, shape),
             position=pose[:3],
             wxyz=pose[3:],
-            cast_shadow=_casts_shadow(shape),
+            cast_shadow=shape.object_type == _GEOM
+            and shape.geom_type != _PLANE
+            and shape.rgba[3] > _TRANSPARENT,
         )
-
-
-def _casts_shadow(shape: Shape) -> bool:
-    is_plane = shape.geom_type == _PLANE
-    return shape.object_type == _GEOM and not is_plane and shape.rgba[3] > _TRANSPARENT
 
 
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:

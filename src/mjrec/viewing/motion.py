@@ -145,6 +145,7 @@ class Stage:
             self.view = self._view()
             self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
             self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+            is_more = len(drawn) > len(self.soft) + len(self.shapes)
             self.shapes += self._hidden_at_first(reader)
             if self._is_drawn_elsewhere(reader, first):
                 self.notes.append(
@@ -153,10 +154,7 @@ class Stage:
                 )
         self._names, self._moving = self._moving_objects()
         self._rgba = {shape.name: shape.rgba for shape in self.shapes}
-        self._has_passing = self.model.ntendon > 0 or any(
-            not _is_fixed_size(geom) and geom.type not in (_SKIN, _FLEX)
-            for geom in drawn
-        )
+        self._has_passing = is_more or self.model.ntendon > 0
         shown = [
             s for s in self.soft if s.is_skin or self.model.flex_dim[s.object_id] != 1
         ]
@@ -229,7 +227,11 @@ class Stage:
                 if self._change_model(reader, step):
                     colours += self._new_colours(trajectory, step, index)
                 self._enter(trajectory, step)
-                placed.append(np.vstack([_places(*each) for each in self._moving]))
+                moving = (
+                    [positions[ids], matrices[ids].reshape(-1, 9)]
+                    for positions, matrices, ids in self._moving
+                )
+                placed.append(np.vstack([np.hstack(each) for each in moving]))
                 target.append(self.data.subtree_com[self._tracked].copy())
                 fovy.append(self.model.cam_fovy.copy())
                 for name, own in flexes.items():
@@ -406,13 +408,6 @@ def _shape(geom: Any, name: str | None = None) -> Shape:
     return Shape(
         name or _name(geom), geom.objtype, geom.objid, int(geom.type), _rgba(geom)
     )
-
-
-def _places(
-    positions: NDArray[Any], matrices: NDArray[Any], wanted: list[int]
-) -> NDArray[np.float64]:
-    """Return positions and rotation matrices of the wanted objects, `(wanted, 12)`."""
-    return np.hstack([positions[wanted], matrices[wanted].reshape(-1, 9)])
 
 
 def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
