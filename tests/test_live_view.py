@@ -180,7 +180,7 @@ def test_states_that_are_not_finite_are_left_out(tmp_path, monkeypatch):
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_that_does_not_exist_is_refused(port, tmp_path):
     """The error says which ports there are."""
-    with pytest.raises(InvalidArgument, match="from 0 to 65535"):
+    with pytest.raises(InvalidArgument, match="must be 0-65535"):
         LiveView(tmp_path, port=port)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
+import io
 import json
 import subprocess
 import sys
@@ -125,6 +126,27 @@ _CAMERA = """() => {
     viewer.camera.fov];
 }"""
 _STEP = "Number(document.getElementById('replay-where').textContent.split(' ')[1])"
+_AFTER_FRAMES = """async (count) => {
+  for (; count > 0; count--) await new Promise(requestAnimationFrame);
+}"""
+_CAST_SHADOWS = """(casts) => {
+  const nodes = Object.entries(window.__viserMutable.nodeRefFromName);
+  for (const [name, node] of nodes) {
+    if (!name.startsWith("/geom/")) continue;
+    node.traverse((part) => {
+      part.userData.casts ??= part.castShadow;
+      part.castShadow = casts && part.userData.casts;
+    });
+  }
+  window.__viserMutable.requestRender();
+}"""
+# Plays until a step is shown, and counts the images until then.
+_IMAGES_UNTIL = f"""async (step) => {{
+  document.getElementById("replay-play").click();
+  let images = 0;
+  for (; {_STEP} < step; images++) await new Promise(requestAnimationFrame);
+  return images;
+}}"""
 _STEP_SHOWN = f"(step) => {_STEP} >= step"
 
 # An episode that goes on until the process is killed.
@@ -161,9 +183,14 @@ def record(name, directory, steps=_STEPS, change=lambda env, step: None, **optio
 
 @pytest.fixture(scope="module")
 def cheetah(tmp_path_factory):
-    """Record a short episode that is cut by its time limit."""
+    """Record a short episode that is cut by its time limit, its last state enlarged."""
+
+    def change(env, step):
+        if step == _STEPS:
+            env.unwrapped.model.cam_fovy[0] = 30
+
     directory = tmp_path_factory.mktemp("cheetah")
-    return record("HalfCheetah-v5", directory, max_episode_steps=_STEPS)
+    return record("HalfCheetah-v5", directory, _STEPS, change, max_episode_steps=_STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +286,11 @@ def test_all_kinds_of_scenes_stand_where_mujoco_has_them(name, pages, tmp_path):
     mjrec.write_replay(trajectory, tmp_path / "page.html")
     page = pages(f"{(tmp_path / 'page.html').as_uri()}#step={_STEPS}")
     check_geoms(page, data_at(trajectory, _STEPS))
+    shown = data_in(tmp_path / "page.html")
+    if shown["camera"] == "free":
+        # It stands where the environment has put it, as in the videos.
+        position, _ = page.evaluate(_CAMERA)
+        assert position == pytest.approx(shown["view"]["position"], abs=1e-4)
 
 
 @pytest.mark.browser
@@ -286,18 +318,89 @@ def test_keys_go_through_the_states(page, cheetah):
 
 @pytest.mark.browser
 def test_a_camera_of_the_model_is_kept_from_step_to_step(page, cheetah):
-    """It moves as in the videos, also if it has the name of one of the page's."""
+    """It moves and zooms as in the videos, also if it is named like one of the page."""
     trajectory = mjrec.load_trajectory(cheetah)
     page.keyboard.press("End")
     page.select_option("#replay-camera", label="track")
-    for step in (_STEPS, _STEPS - 1):
+    for step, zoomed in ((_STEPS, 30), (_STEPS - 1, 45)):
         data = data_at(trajectory, step)
         position, fovy = page.evaluate(_CAMERA)
         assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
-        assert fovy == pytest.approx(data.model.cam_fovy[0])
+        assert fovy == pytest.approx(zoomed)
         assert f"#step={step}&camera=0&" in page.evaluate("location.hash")
         page.keyboard.press(",")
     page.select_option("#replay-camera", label="tracking")
+
+
+@pytest.mark.browser
+def test_dragging_turns_the_free_camera_only(page):
+    """It turns around what it looks at; a camera of the model stays in its place."""
+    page.set_viewport_size({"width": 240, "height": 400})
+    canvas = page.locator("#root canvas").first.bounding_box()
+    x, y = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
+    for camera, turns in (("0", False), ("free", True)):
+        page.select_option("#replay-camera", value=camera)
+        before, _ = page.evaluate(_CAMERA)
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 60, y, steps=4)
+        page.mouse.up()
+        page.evaluate(_AFTER_FRAMES, 10)
+        after, _ = page.evaluate(_CAMERA)
+        assert (np.linalg.norm(np.subtract(after, before)) > 0.5) == turns
+    # It went around, neither up nor nearer.
+    assert after[2] == pytest.approx(before[2], abs=0.01)
+    page.select_option("#replay-camera", label="tracking")
+
+
+@pytest.mark.browser
+def test_bodies_cast_a_shadow_on_the_floor(page):
+    """Places of the gray floor are darker than without the shadows of the bodies."""
+    page.set_viewport_size({"width": 240, "height": 400})
+    page.keyboard.press("Home")
+    page.select_option("#replay-camera", label="track")
+    seen = []
+    for casts in (False, True):
+        page.evaluate(_CAST_SHADOWS, casts)
+        page.evaluate(_AFTER_FRAMES, 10)
+        image = page.locator("#root canvas").first.screenshot()
+        seen.append(np.asarray(Image.open(io.BytesIO(image)).convert("RGB"), int))
+    lit, shaded = seen
+    is_floor = np.abs(lit[:, :, 0] - lit[:, :, 2]) < 40
+    is_darker = (lit - shaded).min(axis=2) > 20
+    assert (is_floor & is_darker).sum() > 20
+    page.select_option("#replay-camera", label="tracking")
+
+
+@pytest.mark.browser
+def test_the_slider_scrubs(page, cheetah):
+    """Dragging it to its middle shows the state in the middle."""
+    page.keyboard.press("Home")
+    place = page.locator("#replay-place").bounding_box()
+    y = place["y"] + place["height"] / 2
+    page.mouse.move(place["x"] + 8, y)
+    page.mouse.down()
+    page.mouse.move(place["x"] + place["width"] / 2, y, steps=4)
+    page.mouse.up()
+    assert page.evaluate(_STEP) == _STEPS / 2
+    assert f"#step={_STEPS // 2}&" in page.evaluate("location.hash")
+    check_geoms(page, data_at(mjrec.load_trajectory(cheetah), _STEPS // 2))
+
+
+@pytest.mark.browser
+def test_the_chosen_speed_plays_faster(page):
+    """At four times the speed, each image is at least a step on; at a tenth, it isn't.
+
+    However slow the machine is, the page goes on by at most a quarter of a second
+    between two images.
+    """
+    images = {}
+    for speed in ("4", "0.1"):
+        page.keyboard.press("Home")
+        page.select_option("#replay-speed", speed)
+        assert page.evaluate("location.hash").endswith(f"&speed={speed}")
+        images[speed] = page.evaluate(_IMAGES_UNTIL, 3)
+    assert images["4"] <= 4 < 6 <= images["0.1"]
 
 
 @pytest.mark.browser
@@ -549,6 +652,17 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
     assert b"NORMAL" in mesh.export(file_type="glb")
     top = mesh.vertex_normals[:, 2] > 0.9
     assert np.ptp(mesh.visual.uv[top], axis=0) == pytest.approx([1, 1])
+
+
+def test_what_only_the_videos_show_elsewhere_is_named(tmp_path):
+    """A hand's goal, which falls in the states, is put in its place to be drawn."""
+    with robots_that_reset():
+        if "HandManipulateBlock-v1" not in gymnasium.registry:
+            pytest.skip("Gymnasium-Robotics is not installed")
+        path = record("HandManipulateBlock-v1", tmp_path / "run", 1)
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    [note] = made.notes
+    assert note.startswith("The videos show some objects in other places")
 
 
 def test_an_episode_without_finite_states_is_refused(cheetah, tmp_path):

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+_NICENESS = 10
 
 
 def view(
@@ -31,10 +34,10 @@ def view(
             model can run any code, so use it only if you trust the author.
     """
     # Imported here so that --help works without the optional packages.
-    from ..viewing.live import LiveView, be_nice
+    from ..viewing.live import LiveView
 
     with LiveView(directory, port=port, trust_models=trust_models) as live:
-        be_nice()
+        os.nice(_NICENESS)
         sys.stdout.write(f"{live.url}\nPress Ctrl-C to stop.\n")
         sys.stdout.flush()
         try:

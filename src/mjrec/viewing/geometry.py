@@ -45,7 +45,9 @@ _COLOUR_ROLES = (
 _HORIZON = 30.0
 _SHARP = 0.6  # radians between faces that make an edge
 _GAMMA = 2.2
-_LIGHT = 1.6
+_AMBIENT = 0.8
+# Directions and intensities of lights without shadows, beside viser's own from above.
+_SIDE_LIGHTS = (((1.0, -0.7, 0.5), 1.2), ((-0.7, 1.0, 0.4), 0.6))
 _TRANSPARENT = 0.999
 
 # For each side of a cube texture, in OpenGL's order: the axis that points at it, and
@@ -75,7 +77,11 @@ def scene_page(stage: Stage, motion: Motion) -> str:
 def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
     model = stage.model
     scene.configure_environment_map(None)
-    scene.add_light_ambient("/light", intensity=_LIGHT)
+    scene.add_light_ambient("/light", intensity=_AMBIENT)
+    for number, (position, intensity) in enumerate(_SIDE_LIGHTS):
+        scene.add_light_directional(
+            f"/light/{number}", position=position, intensity=intensity
+        )
     scene.set_background_image(sky(model))
     for shape in stage.soft:
         mesh = soft_mesh(model, shape)
@@ -88,13 +94,10 @@ def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
             mesh_of(model, shape),
             position=pose[:3],
             wxyz=pose[3:],
-            cast_shadow=_casts_shadow(shape),
+            cast_shadow=shape.object_type == _GEOM
+            and shape.geom_type != _PLANE
+            and shape.rgba[3] > _TRANSPARENT,
         )
-
-
-def _casts_shadow(shape: Shape) -> bool:
-    is_plane = shape.geom_type == _PLANE
-    return shape.object_type == _GEOM and not is_plane and shape.rgba[3] > _TRANSPARENT
 
 
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:

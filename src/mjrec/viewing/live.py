@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import html
-import json
 import os
 import secrets
 import threading
@@ -32,6 +31,7 @@ from ..formats.monitor_directory import (
     lock_name,
     recording_directories,
 )
+from ..json_text import dumps
 from ..results import iter_episodes
 from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
@@ -40,8 +40,6 @@ from .motion import FIXED_FIELDS, Shape, Stage
 from .replay import are_finite, ending_of, motion_chunk, replay_page, title_of
 
 _ADDRESS = "127.0.0.1"
-_MOST_PORTS = 65_535
-_NICENESS = 10
 # Limits of one response; a page requests the rest later.
 _MOST_STATES = 500
 _MOST_EPISODES = 200
@@ -60,7 +58,7 @@ class _Shown:
     @property
     def scene_id(self) -> str:
         """An id shared by all episodes that the same page can show."""
-        return _digest(self.scene, *self.stage.passing)
+        return _digest(self.scene.encode(), *map(str.encode, self.stage.passing))
 
 
 class LiveView:
@@ -94,11 +92,6 @@ class LiveView:
         path = Path(directory)
         if not path.is_dir():
             raise InvalidArgument(f"The directory {path} does not exist.")
-        if not 0 <= port <= _MOST_PORTS:
-            raise InvalidArgument(
-                f"Port {port} does not exist. Choose one from 0 to {_MOST_PORTS}; 0 is "
-                "any free port."
-            )
         self._token = secrets.token_urlsafe(24)
         self._directory = path
         self._trust_models = trust_models
@@ -110,9 +103,9 @@ class LiveView:
         self._lock = threading.Lock()
         try:
             self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             raise InvalidArgument(
-                f"Port {port} cannot be used ({error.strerror}). Omit the port to use "
+                f"Port {port} cannot be used ({error.args[-1]}). Omit the port to use "
                 "any free port."
             ) from error
         self._server.daemon_threads = True
@@ -157,7 +150,7 @@ class LiveView:
                     return
                 except (Error, OSError) as error:
                     # A file may disappear while it is being read; the page retries.
-                    kind, body = "application/json", json.dumps({"error": str(error)})
+                    kind, body = "application/json", dumps({"error": str(error)})
                 content = body.encode()
                 self.send_response(HTTPStatus.OK)
                 self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -186,10 +179,10 @@ class LiveView:
                 case "/":
                     return self._page(asked.get("episode"))
                 case "/episodes":
-                    return json.dumps(self._episodes())
+                    return dumps(self._episodes())
                 case "/motion":
                     first = int(asked.get("from", "0"))
-                    return json.dumps(self._motion(asked["episode"], first))
+                    return dumps(self._motion(asked["episode"], first))
         raise KeyError(page)
 
     def _page(self, name: str | None) -> str:
@@ -224,12 +217,12 @@ class LiveView:
             label = number if are_of_one else f"{infix_of(path.name)} {number}"
             entry: dict[str, Any] = {"name": self._name(path), "label": label}
             if (over := ended.get(path)) is not None:
-                entry |= {"length": over.length, "return": _number(over.reward)}
+                entry |= {"length": over.length, "return": over.reward}
             else:
                 entry["running"] = _is_running(path)
             listed.append(entry)
         stride = max(1, -(-len(returns) // _MOST_POINTS))
-        curve = [_number(each) for each in returns[::stride]]
+        curve = returns[::stride]
         return {"episodes": listed, "count": len(returns), "returns": curve}
 
     def _motion(self, name: str, first: int) -> dict[str, Any]:
@@ -275,33 +268,21 @@ class LiveView:
         return trajectory, shown
 
 
-def be_nice() -> None:
-    """Lower this process's priority below that of all others on this machine."""
-    os.nice(_NICENESS)
-
-
 def _scene(trajectory: Trajectory, stage: Stage) -> str:
     """Return an id of what a new stage shows in all states of its episode."""
     shapes = [(s.name, s.geom_type) for s in (*stage.shapes, *stage.soft)]
-    facts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
+    facts = dumps([sorted(trajectory.facts["model"].items()), shapes])
     sizes = (getattr(stage.model, name).tobytes() for name in FIXED_FIELDS)
-    return _digest(facts, *sizes)
+    return _digest(facts.encode(), *sizes)
 
 
-def _digest(*parts: str | bytes) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part if isinstance(part, bytes) else part.encode())
-    return digest.hexdigest()[:16]
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 def _is_running(path: Path) -> bool:
     """Return whether the monitor that records an unfinished episode is still open."""
     return is_locked(path.parent / lock_name(infix_of(path.name) or ""))
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 _WAITING = (

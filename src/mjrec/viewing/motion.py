@@ -26,10 +26,14 @@ from ..simulation.trajectories import Trajectory
 from ..simulation.view import view_from_facts
 
 _MOST_GEOMS = 20_000
+# The farthest that a geom moves in a substep, in units of the model's extent.
+_LAG = 0.02
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 _DECOR = int(mujoco.mjtCatBit.mjCAT_DECOR)
 _GEOM, _SITE = int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_SITE)
 _TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
+_FIXED_CAMERA = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+_TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _SKIN, _FLEX = int(mujoco.mjtGeom.mjGEOM_SKIN), int(mujoco.mjtGeom.mjGEOM_FLEX)
 # Fields whose changes a page does not show.
 _FIXED = {
@@ -80,7 +84,8 @@ class Motion:
             bone.
         scales: `(N, 3)`, scales of shapes that change size; zero while a shape is
             absent.
-        cameras: `(N, cameras, 7)`, poses of the model's cameras, which look along -z.
+        cameras: `(N, cameras, 8)`, poses of the model's cameras, which look along -z,
+            and their `fovy`.
         target: `(N, 3)`, the point that the tracking camera follows.
         colours: color changes: index of the state, name of the shape, and RGBA from
             that state on.
@@ -140,13 +145,16 @@ class Stage:
             self.view = self._view()
             self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
             self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+            is_more = len(drawn) > len(self.soft) + len(self.shapes)
             self.shapes += self._hidden_at_first(reader)
+            if self._is_drawn_elsewhere(reader, first):
+                self.notes.append(
+                    "The videos show some objects in other places, because the "
+                    "environment moves them only to draw them."
+                )
         self._names, self._moving = self._moving_objects()
         self._rgba = {shape.name: shape.rgba for shape in self.shapes}
-        self._has_passing = self.model.ntendon > 0 or any(
-            not _is_fixed_size(geom) and geom.type not in (_SKIN, _FLEX)
-            for geom in drawn
-        )
+        self._has_passing = is_more or self.model.ntendon > 0
         shown = [
             s for s in self.soft if s.is_skin or self.model.flex_dim[s.object_id] != 1
         ]
@@ -156,19 +164,33 @@ class Stage:
         self._tracked = _tracked_body(self.model)
 
     @property
-    def camera_number(self) -> int | None:
-        """Index of the fixed camera used in the videos; None for other cameras."""
-        is_fixed = self._camera.type == int(mujoco.mjtCamera.mjCAMERA_FIXED)
-        return int(self._camera.fixedcamid) if is_fixed else None
+    def camera(self) -> str:
+        """The camera used in the videos: its index, "track" or "free"."""
+        kinds = {_FIXED_CAMERA: str(self._camera.fixedcamid), _TRACKING: "track"}
+        return kinds.get(int(self._camera.type), "free")
+
+    def _is_drawn_elsewhere(self, reader: TrajectoryReader, step: int) -> bool:
+        """Return whether a state's frame shows geoms away from their places in it.
+
+        Goal markers are an example. A frame may lag behind its state by a substep.
+        """
+        frame = int(np.searchsorted(reader.frame_steps, step))
+        rows = reader.snapshots(frame, min(frame + 1, reader.frame_count))
+        places = rows["geom_xpos"] if "geom_xpos" in (rows.dtype.names or ()) else None
+        if places is None or places.shape != (1, *self.data.geom_xpos.shape):
+            return False
+        ids = [shape.object_id for shape in self.shapes if shape.object_type == _GEOM]
+        moved = places[0, ids] - self.data.geom_xpos[ids]
+        return bool(np.abs(moved).max(initial=0) > _LAG * self.model.stat.extent)
 
     def _view(self) -> tuple[list[float], list[float], float]:
         cameras = self._scene.camera
         position = np.mean([camera.pos for camera in cameras], axis=0)
         distance = self.model.stat.extent
-        if self.camera_number is None:
+        if self._camera.type != _FIXED_CAMERA:
             distance, fovy = self._camera.distance, self.model.vis.global_.fovy
         else:
-            fovy = self.model.cam_fovy[self.camera_number]
+            fovy = self.model.cam_fovy[self._camera.fixedcamid]
         target = position + distance * np.array(cameras[0].forward)
         return position.tolist(), target.tolist(), float(fovy)
 
@@ -190,7 +212,7 @@ class Stage:
         Raises:
             UnreadableFile: the file is missing or damaged.
         """
-        placed, target = [], []
+        placed, target, fovy = [], [], []
         colours: list[tuple[int, str, list[float]]] = []
         passing: list[dict[str, NDArray[np.float64]]] = []
         first, number = self.model.flex_vertadr, self.model.flex_vertnum
@@ -205,8 +227,13 @@ class Stage:
                 if self._change_model(reader, step):
                     colours += self._new_colours(trajectory, step, index)
                 self._enter(trajectory, step)
-                placed.append(np.vstack([_places(*each) for each in self._moving]))
+                moving = (
+                    [positions[ids], matrices[ids].reshape(-1, 9)]
+                    for positions, matrices, ids in self._moving
+                )
+                placed.append(np.vstack([np.hstack(each) for each in moving]))
                 target.append(self.data.subtree_com[self._tracked].copy())
+                fovy.append(self.model.cam_fovy.copy())
                 for name, own in flexes.items():
                     vertices[name].append(self.data.flexvert_xpos[own].copy())
                 passing.append(self._passing_now() if self._has_passing else {})
@@ -230,7 +257,7 @@ class Stage:
             vertices={name: np.array(each) for name, each in vertices.items()},
             poses=poses,
             scales=scales,
-            cameras=every_pose[:, named:],
+            cameras=np.dstack([every_pose[:, named:], fovy]),
             target=np.reshape(target, (len(steps), 3)),
             colours=colours,
         )
@@ -381,13 +408,6 @@ def _shape(geom: Any, name: str | None = None) -> Shape:
     return Shape(
         name or _name(geom), geom.objtype, geom.objid, int(geom.type), _rgba(geom)
     )
-
-
-def _places(
-    positions: NDArray[Any], matrices: NDArray[Any], wanted: list[int]
-) -> NDArray[np.float64]:
-    """Return positions and rotation matrices of the wanted objects, `(wanted, 12)`."""
-    return np.hstack([positions[wanted], matrices[wanted].reshape(-1, 9)])
 
 
 def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:

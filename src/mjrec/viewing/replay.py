@@ -153,8 +153,8 @@ def replay_page(
     )
     notes = "".join(f"<p>{html.escape(note)}</p>" for note in about["notes"])
     options = "".join(
-        f'<option value="{number}">{html.escape(camera["name"])}</option>'
-        for number, camera in enumerate(about["cameras"])
+        f'<option value="{number}">{html.escape(name)}</option>'
+        for number, name in enumerate(about["cameras"])
     )
     controls = _file("replay.html").format(
         cameras=options, notes=notes, title=html.escape(about["title"])
@@ -240,18 +240,13 @@ def _skin(stage: Stage, skin: int) -> dict[str, Any]:
 def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, Any]:
     model = stage.model
     position, target, fovy = stage.view
-    cameras = [
-        {"name": model.camera(i).name or str(i), "fovy": float(model.cam_fovy[i])}
-        for i in range(model.ncam)
-    ]
-    number = stage.camera_number
     return {
         "title": title_of(trajectory),
         "steps": len(trajectory),
         "ending": ending_of(trajectory),
         "hasRewards": bool(len(trajectory.rewards)),
-        "cameras": cameras,
-        "camera": "track" if number is None else str(number),
+        "cameras": [model.camera(i).name or str(i) for i in range(model.ncam)],
+        "camera": stage.camera,
         "extent": float(model.stat.extent),
         "view": {"position": position, "target": target, "fovy": fovy},
         "start": motion.target[0].tolist(),

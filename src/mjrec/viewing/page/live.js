@@ -71,11 +71,11 @@
     canvas.width = width;
     canvas.height = height;
     const context = canvas.getContext("2d");
-    const finite = returns.filter((each) => each !== null);
+    const finite = returns.filter(Number.isFinite);
     const low = Math.min(...finite), high = Math.max(...finite);
     context.fillStyle = "#2563a8";
     returns.forEach((each, index) => {
-      if (each === null) return;
+      if (!Number.isFinite(each)) return;
       const x = 2 + ((width - 5) * index) / Math.max(1, returns.length - 1);
       const y = 2 + (height - 5) * (1 - (each - low) / (high - low || 1));
       context.fillRect(x - 1, y - 1, 3, 3);

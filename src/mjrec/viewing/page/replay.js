@@ -25,7 +25,7 @@
     const index = new Map(names.map((name, place) => [name, place]));
     const soft = Object.entries(chunk.vertices).map(([name, count]) => [name, 3 * count]);
     const sizes = [
-      4, 3, 7 * about.cameras.length, 7 * names.length, 3 * scaled.length,
+      4, 3, 8 * about.cameras.length, 7 * names.length, 3 * scaled.length,
       ...soft.map(([, size]) => size),
     ];
     const width = sizes.reduce((sum, size) => sum + size, 0);
@@ -185,13 +185,13 @@
       followed = target;
     } else if (chosen !== "free") {
       const number = Number(chosen);
-      const pose = Array.from(frame.cameras.subarray(7 * number, 7 * number + 7));
-      const [position, wxyz] = [pose.slice(0, 3), pose.slice(3)];
+      const pose = Array.from(frame.cameras.subarray(8 * number, 8 * number + 8));
+      const [position, wxyz] = [pose.slice(0, 3), pose.slice(3, 7)];
       const ahead = rotated(wxyz, [0, 0, -1]);
       const distance = about.extent;
       look(
         position, position.map((each, i) => each + distance * ahead[i]),
-        rotated(wxyz, [0, 1, 0]), about.cameras[number].fovy,
+        rotated(wxyz, [0, 1, 0]), pose[7],
       );
     }
   }
@@ -204,7 +204,9 @@
     if (select.value !== value) select.value = "free";
     if (isFree(select.value) && !isFree(before)) {
       const { position, target, fovy } = about.view;
-      const at = Array.from(frames[current].target);
+      // At first, the free camera is where the environment has put it.
+      const isFirst = before === undefined && value === "free";
+      const at = isFirst ? about.start : Array.from(frames[current].target);
       const move = at.map((each, i) => each - about.start[i]);
       const moved = (point) => point.map((each, i) => each + move[i]);
       look(moved(position), moved(target), [0, 0, 1], fovy);
