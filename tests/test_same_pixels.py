@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is drawn from recorded states is what `render()` shows, byte for byte."""
+"""Frames drawn from recorded states equal those of `render()`, byte for byte."""
 
 import contextlib
 import copy
@@ -44,28 +44,25 @@ def suite_tasks():
     return list(suite.ALL_TASKS)
 
 
-def every(names, cases, *default):
-    """Try all environments under `scripts/test --all`, and these by default."""
+def parametrize_environments(names, cases, *default):
     return parametrize(names, cases, default=default, part=pytest.mark.environments)
 
 
 @pytest.fixture(scope="module")
 def workers():
-    """A process that draws, and three that share a video."""
     with WorkerPool(1) as one, WorkerPool(3) as three:
         yield [one, three]
 
 
 def check_frames(directory, live, workers, *, is_seen_to_move=True):
-    """Check that the frames of a recording are the frames of their moments."""
+    """Check that drawn frames equal live frames."""
     paths = {*directory.glob("*.h5"), *in_flight(directory)}
     for episode, frames in enumerate(live):
         [path] = [p for p in paths if p.name.endswith(f".episode{episode:06d}.h5")]
         for pool in workers[: 1 if episode else None]:
             drawn = list(pool.frames(path, range(len(frames))))
             np.testing.assert_array_equal(drawn, frames)
-    # There was something to compare.
-    assert live[0][0].std() > 3
+    assert live[0][0].std() > 3  # not blank
     if is_seen_to_move:
         assert len({frame.tobytes() for frames in live for frame in frames}) > len(live)
 
@@ -76,9 +73,8 @@ def monitored(env, directory, **options):
 
 
 def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
-    """Record two episodes, and return the frames of every moment."""
-    # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
-    # current: one that an earlier test has left is not to go between two frames.
+    """Record two episodes, and return all frames."""
+    # MuJoCo frees a viewer in the current context: collect those of earlier tests now.
     gc.collect()
     with monitored(env, directory, **options) as monitor:
         frame = frame or monitor.render
@@ -88,7 +84,7 @@ def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
 
 
 def episodes(env, wrapped, look, each_step=lambda _: None):
-    """Play two episodes, and yield what is seen at the moments of each."""
+    """Play two episodes; yield each one's results of `look`."""
     random = np.random.RandomState(1)
     is_gymnasium = hasattr(env, "unwrapped")
     space = env.action_space if is_gymnasium else env.action_spec()
@@ -108,7 +104,6 @@ def episodes(env, wrapped, look, each_step=lambda _: None):
 
 
 def draw_quickly(model):
-    """Make a model whose frames cost a software renderer little."""
     model.vis.quality.shadowsize = 256
     model.vis.quality.offsamples = 0
 
@@ -119,25 +114,21 @@ def make(env_id, **kwargs):
     return env
 
 
-# --- Gymnasium -----------------------------------------------------------------------
-
-
-def test_quality_that_the_model_asks_for(workers, tmp_path):
-    """Gymnasium's own, with shadows and smooth edges; all others are simpler."""
+def test_full_quality(workers, tmp_path):
+    """With Gymnasium's shadows and antialiasing, which the other tests reduce."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array")
     live = record(gymnasium.wrappers.TimeLimit(env, 2), tmp_path)
     check_frames(tmp_path, live, workers[:1])
 
 
-@every("env_id", GYMNASIUM, "HalfCheetah-v5")
+@parametrize_environments("env_id", GYMNASIUM, "HalfCheetah-v5")
 def test_gymnasium(env_id, workers, tmp_path):
-    """The default camera, which the first frame settles."""
     check_frames(tmp_path, record(make(env_id), tmp_path), workers)
 
 
-@every("env_id", GYMNASIUM, "Hopper-v5")
+@parametrize_environments("env_id", GYMNASIUM, "Hopper-v5")
 def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
-    """Made with the environment, by name or number; or asked of the monitor."""
+    """The environment or the monitor names the camera."""
     model = gymnasium.make(env_id).unwrapped
     for number in range(model.model.ncam):
         name = model.model.camera(number).name
@@ -150,10 +141,9 @@ def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
         check_frames(tmp_path / f"{number} asked", live, workers[:1])
 
 
-def test_camera_and_options_that_the_user_gave(workers, tmp_path, monkeypatch):
-    """Those of the environment's arguments, and of its viewer in mid-episode."""
-    # MuJoCo writes a log file when the scene is full.
-    monkeypatch.chdir(tmp_path)
+def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
+    """Arguments of the environment, then changes to its viewer within an episode."""
+    monkeypatch.chdir(tmp_path)  # for MuJoCo's log of full scenes
     env = make(
         "Ant-v5",
         max_geom=12,
@@ -169,16 +159,15 @@ def test_camera_and_options_that_the_user_gave(workers, tmp_path, monkeypatch):
     check_frames(tmp_path, record(env, tmp_path, each_step=change), workers[:1])
 
 
-@every("env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5")
+@parametrize_environments(
+    "env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5"
+)
 def test_robotics(env_id, workers, tmp_path):
     """Also where each `render` moves goals."""
     with robots_that_reset():
         live = record(make(env_id), tmp_path)
-    # In large mazes the ant is too small to be seen.
+    # The ant is too small to see in large mazes.
     check_frames(tmp_path, live, workers[:1], is_seen_to_move=False)
-
-
-# --- dm_control ----------------------------------------------------------------------
 
 
 def record_dm(env, directory, camera):
@@ -190,14 +179,14 @@ def record_dm(env, directory, camera):
 
 
 @pytest.mark.dm_control
-@every(
+@parametrize_environments(
     "domain, task, visualize_reward",
     [(*task, reward) for task in suite_tasks() for reward in (False, True)],
     ("finger", "turn_easy", True),
     ("quadruped", "escape", False),
 )
 def test_suite(domain, task, visualize_reward, workers, tmp_path):
-    """Every task, from every camera, and with colours that show the reward."""
+    """Each task from each camera; `visualize_reward` changes colors."""
     from dm_control import suite
 
     options = {"task_kwargs": {"random": 5}, "visualize_reward": visualize_reward}
@@ -211,7 +200,7 @@ def test_suite(domain, task, visualize_reward, workers, tmp_path):
 
 
 def composer_environments():
-    """Return what makes each; no soccer, whose rewards are one for each player."""
+    """Return constructors by name, without soccer, which has a reward per player."""
     if not has_dm_control:
         return {}
     from dm_control import manipulation
@@ -231,18 +220,16 @@ def composer_environments():
 
 
 @pytest.mark.dm_control
-@every(
+@parametrize_environments(
     "name, camera",
     [(name, camera) for name in composer_environments() for camera in (None, 0)],
     ("reach_site_features", None),
 )
 def test_composer(name, camera, workers, tmp_path):
-    """Tasks that compile another model for every episode."""
+    """Such tasks compile a new model for each episode."""
     live = record_dm(composer_environments()[name](), tmp_path, camera)
     check_frames(tmp_path, live, workers[:1])
 
-
-# --- one's own -----------------------------------------------------------------------
 
 ENDLESS = """
 <mujoco>
@@ -288,12 +275,11 @@ def endless(tmp_path):
 
 
 def test_own_model_over_an_infinite_plane(endless, workers, tmp_path):
-    """It is drawn around the camera of the frame before; and a tendon is taut."""
+    """The plane is drawn around the previous frame's camera; a tendon is taut."""
     check_frames(tmp_path / "out", record(endless, tmp_path / "out"), workers)
 
 
-def test_an_episode_may_forget_the_frames_before(endless, tmp_path):
-    """Cameras are where they are in a new simulation then."""
+def test_forget_frames_resets_cameras(endless, tmp_path):
     directory, previous = tmp_path / "out", []
     with monitored(endless, directory) as monitor:
         for number in range(3):
@@ -309,8 +295,6 @@ def test_an_episode_may_forget_the_frames_before(endless, tmp_path):
 
 
 class Negative(InvertedPendulumEnv):
-    """Shows itself in other colours."""
-
     def render(self):
         return 255 - super().render()
 
@@ -325,10 +309,8 @@ class Negative(InvertedPendulumEnv):
         (lambda: InvertedPendulumEnv(render_mode="depth_array", **SIZE), "depth_array"),
     ],
 )
-def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
-    make_env, named, tmp_path
-):
-    """Said in the error, or in the metadata of the video of what render() shows."""
+def test_overridden_render_is_recorded_live(make_env, named, tmp_path):
+    """`render="deferred"` is an error; metadata names the reason."""
     env = make_env()
     with pytest.raises(mjrec.PicturesDiffer) as error:
         mjrec.Monitor(env, tmp_path / "out", render="deferred")
@@ -348,25 +330,25 @@ POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
 
 
 @pytest.mark.parametrize(
-    ("options", "arrays", "said"),
+    ("options", "arrays", "reason"),
     [
         ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT in the visual options"),
-        # The first frame is compared, whatever the reason for a difference is.
+        # The self-check compares the first frame.
         ({}, ("geom_xmat",), "drawn from its snapshot differs"),
     ],
 )
-def test_what_states_do_not_tell_is_drawn_live(
-    options, arrays, said, tmp_path, monkeypatch, caplog
+def test_frames_that_states_cannot_give_are_drawn_live(
+    options, arrays, reason, tmp_path, monkeypatch, caplog
 ):
-    """Why is in the log; it is an error where another way was asked for."""
+    """The log names the reason; `render="deferred"` is an error."""
     if arrays:
         monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", arrays)
     env = make("InvertedPendulum-v5", **options)
-    with pytest.raises(mjrec.PicturesDiffer, match=said):
+    with pytest.raises(mjrec.PicturesDiffer, match=reason):
         monitored(env, tmp_path / "deferred").reset(seed=0)
     with mjrec.Monitor(env, tmp_path / "live", allow_early_reset=True) as monitor:
         monitor.reset(seed=0)
-    assert said in caplog.text
+    assert reason in caplog.text
     assert len(frames_in(tmp_path / "live", 0)) == 1
 
 
@@ -375,7 +357,7 @@ def show(viewer, what):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         (lambda env, viewer: viewer.add_marker(pos=np.zeros(3)), "markers were added"),
         (
@@ -387,8 +369,7 @@ def show(viewer, what):
         (lambda env, viewer: show(viewer, "INERTIA"), "xipos"),
     ],
 )
-def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
-    """In the middle of an episode; nothing is shown that `render()` does not."""
+def test_frames_end_where_states_no_longer_suffice(change, reason, tmp_path, caplog):
     env = make("InvertedPendulum-v5")
     monitor = monitored(env, tmp_path)
     monitor.reset(seed=0)
@@ -396,29 +377,22 @@ def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
     change(env.unwrapped, env.unwrapped.mujoco_renderer.viewer)
     monitor.step(np.zeros(1))
     monitor.close()
-    assert said in caplog.text
+    assert reason in caplog.text
     [path] = tmp_path.glob("*.trajectory.*")
     with open_trajectory(path) as trajectory:
         assert trajectory.frame_count == 1
 
 
-# --- recording disturbs nothing ------------------------------------------------------
-
-
-# dm_control's, without which there is no such task.
 QUADRUPED = pytest.param("quadruped-escape", marks=pytest.mark.dm_control)
 
 
-@every(
+@parametrize_environments(
     "name",
     ["HalfCheetah-v5", *robotics_ids(), QUADRUPED],
     *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1", QUADRUPED),
 )
 def test_recording_disturbs_nothing(name, tmp_path):
-    """Bit for bit all is as without, random numbers too, also where render() disturbs.
-
-    And no viewer or context is made.
-    """
+    """States and random numbers stay equal bit for bit; no viewer is made."""
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def run(wrap):
