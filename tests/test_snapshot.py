@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Snapshots: restored into data that is not a number, they give the same scene."""
+"""Restored snapshots give the same scene, also into data full of NaN."""
 
 import copy
 from pathlib import Path
@@ -22,8 +22,7 @@ from mjrec.simulation.snapshot import (
 from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView
 
-# A weight on a cable that is pulled beyond its length, a slack cable that hangs
-# through although its limit is active already, and one with a colour of its own.
+# A taut cable, a slack one whose limit is active already, and a colored one.
 TENDONS = """
 <mujoco>
   <worldbody>
@@ -68,7 +67,7 @@ FLEX = """
 </mujoco>
 """
 
-# A little of everything that a visual option shows.
+# Something for every visual option.
 THINGS = """
 <mujoco>
   <option timestep=".005"/>
@@ -98,8 +97,7 @@ THINGS = """
 </mujoco>
 """
 
-
-# With a skin, which follows positions and orientations of bodies.
+# Has a skin, which follows bodies.
 SKIN = str(Path(__file__).parent.parent / "assets/showcase.xml")
 
 
@@ -109,8 +107,7 @@ def simulated(xml):
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.7
     data.xfrc_applied[-1, :3] = (1, 2, 3)
-    # Other than in fresh data.
-    data.eq_active[1:] = False
+    data.eq_active[1:] = False  # unlike in fresh data
     mujoco.mj_step(model, data, nstep=20 if xml == SKIN else 5)
     return model, data
 
@@ -125,7 +122,6 @@ def view(model, option):
 
 
 def restore_checked(row, model, data):
-    """Do what is done with the first snapshot of a file."""
     check_layout(model, data, row.dtype)
     restore_snapshot(row, model, data)
 
@@ -135,19 +131,17 @@ def row_of(model, data, option=None):
 
 
 def changed(row, **values):
-    """Return a snapshot with other arrays, or without those that are None."""
+    """Return a snapshot with other arrays; None removes one."""
     arrays = {name: row[name] for name in row.dtype.names} | values
-    held = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
-    record = np.zeros(
-        1, packed((n, (each.dtype, each.shape)) for n, each in held.items())
-    )
-    for name, each in held.items():
+    kept = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
+    record = np.zeros(1, packed((n, (a.dtype, a.shape)) for n, a in kept.items()))
+    for name, each in kept.items():
         record[name] = each
     return record[0]
 
 
 def differences_of(model, data, option=None):
-    """Return in what the scene of a restored snapshot differs from the live one."""
+    """Return the differences between the live scene and a restored one."""
     row = row_of(model, data, option)
     fresh_model = copy.copy(model)
     fresh = mujoco.MjData(fresh_model)
@@ -165,8 +159,7 @@ def differences_of(model, data, option=None):
 
 
 @pytest.mark.parametrize("xml", [TENDONS, SENSORS, FLEX, THINGS, SKIN])
-def test_a_restored_snapshot_gives_the_same_scene(xml):
-    """Byte by byte, with tendons, rays, flexes, skins and all that is usual."""
+def test_restored_snapshot_gives_the_same_scene(xml):
     assert differences_of(*simulated(xml)) == []
 
 
@@ -180,7 +173,6 @@ def test_a_restored_snapshot_gives_the_same_scene(xml):
         ("ten_wrapnum", -5, "use points up to"),
         ("wrap_obj", 10**8, "but its values range"),
         ("wrap_obj", -3, "but its values range"),
-        # It would become some index.
         ("ten_wrapadr", np.full(4, np.nan), "ten_wrapadr is .*f8"),
         ("geom_xpos", np.zeros((1, 3)), "belong to another model or version"),
         ("qpos", np.zeros(1), "which is not used for drawing"),
@@ -188,8 +180,8 @@ def test_a_restored_snapshot_gives_the_same_scene(xml):
         ("geom_xpos", None, "lack geom_xpos"),
     ],
 )
-def test_a_snapshot_that_cannot_be_is_refused(name, value, words):
-    """A file may be hostile, and MuJoCo would read foreign memory."""
+def test_invalid_snapshot_is_refused(name, value, words):
+    """MuJoCo would read memory out of bounds."""
     model, data = simulated(TENDONS)
     row = row_of(model, data)
     if isinstance(value, int):
@@ -200,7 +192,7 @@ def test_a_snapshot_that_cannot_be_is_refused(name, value, words):
 
 
 FLAGS = [[name] for name in mujoco.mjtVisFlag.__members__][:-1]
-# Flags that show something only together with another one.
+# Flags that need another one.
 FLAGS += [["mjVIS_ACTUATOR", "mjVIS_ACTIVATION"], ["mjVIS_INERTIA", "mjVIS_SCLINERTIA"]]
 FRAMES = [[name] for name in mujoco.mjtFrame.__members__][:-1]
 LABELS = [[name] for name in mujoco.mjtLabel.__members__][:-1]
@@ -208,7 +200,6 @@ LABELS = [[name] for name in mujoco.mjtLabel.__members__][:-1]
 
 @pytest.mark.parametrize("shown", [*FLAGS, *FRAMES, *LABELS], ids="-".join)
 def test_every_flag_frame_and_label_is_exact_or_refused(shown):
-    """Each visual option, turned over, is restored exactly or said to be impossible."""
     option = mujoco.MjvOption()
     for name in shown:
         if name in mujoco.mjtVisFlag.__members__:
@@ -227,8 +218,8 @@ def test_every_flag_frame_and_label_is_exact_or_refused(shown):
         assert shown[0] in reason
 
 
-def test_a_tendons_spring_that_has_yielded_is_restored():
-    """Since mujoco 4 how far a cable hangs through depends on what it went through."""
+def test_yielded_tendon_spring_is_restored():
+    """Since mujoco 4 a cable's sag depends on its history."""
     xml = TENDONS.replace(
         "<spatial><site",
         '<spatial springlength="0 .4" stiffness="1" springyield="1"><site',
@@ -239,9 +230,6 @@ def test_a_tendons_spring_that_has_yielded_is_restored():
         pytest.skip("no plastic tendons before mujoco 4")
     data.plastic[1] = 0.9
     assert differences_of(model, data) == []
-
-
-# --- the check that a snapshot suffices ----------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -258,8 +246,8 @@ def test_a_tendons_spring_that_has_yielded_is_restored():
         (SKIN, "xquat", "skin"),
     ],
 )
-def test_a_field_that_is_forgotten_is_noticed(xml, field, words):
-    """As one would be that only a later MuJoCo reads; nothing is written to."""
+def test_self_check_notices_a_missing_field(xml, field, words):
+    """A later MuJoCo may read other fields; the check writes nothing."""
     model, data = simulated(xml)
     shown = view(model, None)
     if field == "cam_xpos":
