@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules by which episodes are chosen after they ended."""
+"""Rules that choose episodes after they ended."""
 
 import math
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from mjrec import InvalidArgument, UnknownName
 from mjrec.recorder.keep_rules import RULES, keep_rule
 
 
-class Ended(NamedTuple):
-    """An episode that has ended; one without a reward could not be completed."""
+class Episode(NamedTuple):
+    """An ended episode; one without a reward failed."""
 
     number: int
     reward: float | None
@@ -19,10 +19,9 @@ class Ended(NamedTuple):
     success: bool | None = None
 
 
-def episodes(*returns, **of):
-    """Return episodes 0, 1 ... of one run."""
+def episodes(*returns, **facts):
     return [
-        Ended(number, value, **{name: values[number] for name, values in of.items()})
+        Episode(number, value, **{name: each[number] for name, each in facts.items()})
         for number, value in enumerate(returns)
     ]
 
@@ -34,44 +33,43 @@ def chosen(keep, ended):
 @pytest.mark.parametrize(
     ("returns", "keep", "expected"),
     [
-        # In the order of the rule, and within a part by rank.
+        # In the order of the rules, then by rank.
         ([5, 1, 4, 2, 3], "best,median,worst", "0 best, 4 median, 1 worst"),
         ([5, 1, 4, 2], "worst:2,best:2", "1 worst, 3 worst, 0 best, 2 best"),
-        # Of equal returns the earlier counts; one episode may be all three.
+        # Ties go to the earlier episode, which may have all roles.
         ([2, 2, 2], "best,median,worst", "0 best, 0 median, 0 worst"),
         ([9, 5, 0, 5, 5], "median", "1 median"),
-        # An episode that was played, never a mean of two: the lower.
+        # The median of an even number is the lower one.
         ([1, 2, 3, 4], "median", "1 median"),
-        # What is no number is below minus infinity.
+        # NaN is below minus infinity.
         (
             *([1, math.nan, -math.inf, math.inf], "worst:2,best"),
             "1 worst, 2 worst, 3 best",
         ),
-        # What failed is neither best nor worst.
+        # Failed episodes are neither best nor worst.
         ([None, None], "best:9,median,worst", ""),
         ([None, 3, 2], "worst", "2 worst"),
-        # Over all runs of a task; failed ones count, so that others keep numbers.
+        # Failed episodes count in a schedule.
         ([None] + [0.0] * 29, "cubic", "0 cubic, 1 cubic, 8 cubic, 27 cubic"),
         ([1, 2, None], "all", "0 all, 1 all, 2 all"),
         ([1, 2], "none", ""),
     ],
 )
 def test_episodes_are_chosen_by_return(returns, keep, expected):
-    """By what each part of a rule says."""
     found = chosen(keep, episodes(*returns))
     assert ", ".join(f"{number} {role}" for number, role in found) == expected
 
 
-def test_failures_are_what_was_no_success():
-    """By the environment's word, else by its termination; and what broke."""
+def test_failures_follow_success_or_termination():
+    """Failed episodes count as failures."""
     results = episodes(1, 2, 3, None, success=[True, False, None, None])
     assert chosen("failures", results) == [(1, "failure"), (3, "failure")]
     assert chosen("failures:1", results) == [(1, "failure")]
     assert chosen("failures", episodes(1, terminated=[True])) == [(0, "failure")]
 
 
-def test_what_was_never_begun_is_counted_and_never_chosen():
-    """Later episodes keep their numbers, and the next failure takes its place."""
+def test_missing_episodes_count_but_are_never_chosen():
+    """Later episodes keep their numbers."""
     ended = [None, *episodes(None, 1.0)]
     assert chosen("cubic", ended) == [(0, "cubic")]
     assert chosen("all", ended) == [(0, "all"), (1, "all")]
@@ -79,8 +77,8 @@ def test_what_was_never_begun_is_counted_and_never_chosen():
     assert chosen("best,median,worst", [None]) == []
 
 
-def test_an_unknown_rule_lists_the_rules():
-    """With each form; a monitor's are fewer, and some rules stand alone."""
+def test_unknown_rule_lists_the_rules():
+    """Monitors have fewer rules; some rules stand alone."""
     for keep in ("bset", "", "best:0", "best:x", "median:2", "best,"):
         with pytest.raises(UnknownName, match=r"best:N.*cubic, all, none"):
             keep_rule(keep)
@@ -89,5 +87,4 @@ def test_an_unknown_rule_lists_the_rules():
     for keep in ("best,all", "none,none", "best,best:2", None):
         with pytest.raises(InvalidArgument):
             keep_rule(keep)
-    # What is only spelling is not part of its name.
     assert keep_rule("best, worst").name == "best,worst"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a model and a view has changed: everything that has, and nothing else."""
+"""Changes to a model or view are noticed, and only changes."""
 
 import mujoco
 import numpy as np
@@ -47,7 +47,7 @@ def view():
 
 
 def change(struct, name):
-    """Set a field, or the last number of one, to another value."""
+    """Change a field, or the last byte of an array."""
     holder, last = holder_of(struct, name)
     value = getattr(holder, last)
     if isinstance(value, np.ndarray):
@@ -56,8 +56,8 @@ def change(struct, name):
         setattr(holder, last, value + 1)
 
 
-def test_a_change_of_any_field_is_noticed(model):
-    """Every array with elements, every member of `opt`, `vis` and `stat`: by name."""
+def test_change_of_any_field_is_noticed_by_name(model):
+    """Every array with elements, and every member of `opt`, `vis` and `stat`."""
     looks = Looks(model)
     looks.follow(view())
     arrays = [name for name in array_names() if getattr(model, name).size]
@@ -77,8 +77,7 @@ def test_a_change_of_any_field_is_noticed(model):
 
 
 @pytest.mark.parametrize("which", ["camera", "option"])
-def test_every_member_of_a_view_is_watched(model, which):
-    """One change, one name, once."""
+def test_change_of_any_view_member_is_noticed_once(model, which):
     looks, shown = Looks(model), view()
     looks.follow(shown)
     struct = getattr(shown, which)

@@ -30,9 +30,7 @@ def git(directory, *arguments):
     return subprocess.check_output(command, cwd=directory, text=True).strip()
 
 
-def test_provenance_of_a_program_in_a_repository(
-    tmp_path, tmp_path_factory, monkeypatch
-):
+def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
     """The manifest has its command, packages, variables, commit and policy."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a row holds of a simulation, and the memory that it is gathered from."""
+"""States in rows, and the memory that they are gathered from."""
 
 import mujoco
 import numpy as np
@@ -9,7 +9,7 @@ from mjrec.formats.trajectory import columns_of
 from mjrec.simulation.raw_memory import WORDS
 from mjrec.simulation.states import read_state, state_dtype, state_words
 
-# Something of every component but plugins'.
+# Has every component except plugins.
 FULL = """
 <mujoco>
   <size nuserdata="3"/>
@@ -25,8 +25,8 @@ FULL = """
 
 
 @pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
-def test_the_words_of_a_state_are_what_mujoco_gives(xml):
-    """Mocap bodies, user data, activations and forces from outside as well."""
+def test_state_words_equal_mujocos_state(xml):
+    """With mocap bodies, user data, activations and applied forces."""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     data.mocap_pos[:] = 7
@@ -40,8 +40,8 @@ def test_the_words_of_a_state_are_what_mujoco_gives(xml):
         assert WORDS.take(words).tobytes() == read_state(model, data).tobytes()
 
 
-def test_components_are_where_mujoco_puts_them():
-    """The arrays of `MjData` are found in its vector by name; empty ones are none."""
+def test_components_are_named_after_arrays_of_mjdata():
+    """Empty components are left out."""
     equality = '<equality><weld body1="moved" body2="free"/></equality>'
     model = mujoco.MjModel.from_xml_string(FULL.format(equality=equality))
     data = mujoco.MjData(model)
@@ -55,5 +55,5 @@ def test_components_are_where_mujoco_puts_them():
         np.testing.assert_array_equal(values, np.ravel(expected), err_msg=name)
     assert {"qpos", "qvel", "act", "ctrl", "eq_active", "mocap_quat"} <= parts.keys()
     assert sum(map(len, parts.values())) == len(row)
-    # Whether an equality is active is a byte here and a number there.
+    # `eq_active` is a byte in memory and a float in the state.
     assert state_words(model, data) is None
