@@ -169,7 +169,6 @@ def test_json_text_keeps_any_value(value):
     [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
 )
 def test_keys_with_equal_text_are_written_as_repr(value):
-    """A reader would refuse a duplicate key."""
     assert "repr" in dumps(value)
     assert dumps(loads(dumps(value))) == dumps(value)
 

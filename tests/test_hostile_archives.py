@@ -204,7 +204,7 @@ def test_malicious_archive_is_refused(make, reason, tmp_path):
 
 
 def test_verification_refuses_malicious_archives(tmp_path, monkeypatch):
-    """Nothing of the archive is left; the error says what to do."""
+    """It leaves no files, and the error says what to do."""
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -221,7 +221,6 @@ def test_verification_refuses_malicious_archives(tmp_path, monkeypatch):
 
 
 def test_archive_larger_than_the_free_disk_is_refused(tmp_path, monkeypatch):
-    """The error comes before anything is written."""
     path = tmp_path / "run.zip"
     write(path, (NAME, bytes(1000)))
     usage = type("Usage", (), {"free": 999})

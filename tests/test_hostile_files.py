@@ -70,7 +70,7 @@ def directory(tmp_path):
 
 @pytest.mark.parametrize("kind", FILES)
 def test_valid_file_is_read(inspector, directory, kind):
-    """So the tests below refuse a file for its damage alone."""
+    """The tests below then refuse a file for its damage alone."""
     reader, write = FILES[kind]
     inspector.reads(reader, write(directory))
 
@@ -119,7 +119,6 @@ def test_only_regular_files_in_the_directory_are_opened(
 
 
 def test_links_within_the_directory_are_followed(directory):
-    """So are the user's own links from elsewhere, under other names."""
     path = finished(directory)
     kept = path.rename(directory / "kept.h5")
     path.symlink_to(kept.name)
@@ -144,7 +143,7 @@ CORRUPTIONS = {
 @pytest.mark.parametrize("corruption", CORRUPTIONS)
 @pytest.mark.parametrize("kind", [k for k in FILES if k != "video for an archive"])
 def test_corrupt_content_is_refused(inspector, directory, kind, corruption):
-    """Journals and logs may also be read as far as they are whole."""
+    """Journals and logs may be read up to the damage."""
     reader, write = FILES[kind]
     path = write(directory)
     CORRUPTIONS[corruption](path)
@@ -452,7 +451,7 @@ def test_newer_format_asks_for_an_update(directory):
 
 
 def test_names_that_lead_elsewhere_are_ignored(directory):
-    """So is a pending video whose path begins like a name in the directory."""
+    """A pending video's path may begin like a name in the directory."""
     outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
     outside.write_bytes(b"")
     metadata(directory.parent)
@@ -506,7 +505,6 @@ def test_mismatched_model_change_names_the_file(directory):
 
 
 def test_compiled_model_is_named_after_its_content(inspector, directory):
-    """Otherwise one file could stand for two models."""
     path = FILES["mjb.gz"][1](directory)
     other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
     facts = directory / "facts.json"

@@ -51,7 +51,6 @@ def read(path):
     ],
 )
 def test_entries_are_read_back(path, facts):
-    """Also values that JSON has no number for."""
     writer = JournalWriter(path)
     assert not path.exists()
     writer.append(entry_with(**facts))
@@ -66,7 +65,7 @@ def test_entries_are_read_back(path, facts):
 
 
 def test_options_of_any_type_and_size_are_written(path):
-    """As their repr, cut to a limit."""
+    """The journal has their repr, cut to a limit."""
     write(path, entry_with(options={"lock": re}), entry_with(options="x" * (1 << 24)))
     first, second = (json.loads(line) for line in path.read_text().splitlines())
     assert "module 're'" in first["options"]["lock"]["repr"]
@@ -106,7 +105,6 @@ def test_cut_last_line_is_left_out(path, caplog):
     ],
 )
 def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
-    """The warning names line and reason."""
     late = entry_with(episode_id=10**14)
     write(path, late, NEXT, entry_with(reward=9.0, episode_id=4), ENTRY, late)
     first, *rest = path.read_bytes().splitlines(keepends=True)
@@ -119,7 +117,6 @@ def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
 
 
 def test_reading_stops_at_a_thousand_damaged_lines(path, caplog):
-    """And at a line that is too long."""
     write(path, ENTRY)
     line = path.read_bytes()
     path.write_bytes(b"\n" * 999 + line)
@@ -136,7 +133,6 @@ def test_reading_stops_at_a_thousand_damaged_lines(path, caplog):
 
 
 def test_failed_line_is_written_before_the_next_one(path):
-    """Half a line left by Ctrl-C is removed."""
     writer = JournalWriter(path)
     writer.append(ENTRY)
     # A full disk takes only the first part of the line.

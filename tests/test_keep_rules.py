@@ -118,7 +118,6 @@ def test_missing_episodes_count_but_are_never_chosen():
 
 
 def test_function_gets_all_episodes_once_in_order():
-    """It may return NumPy integers."""
     calls = []
 
     def longest(ended):

@@ -71,7 +71,7 @@ def test_release_removes_only_its_own_file(path):
 @pytest.mark.parametrize("way", ["Lock", "try_lock"])
 @pytest.mark.parametrize("survivor", SURVIVORS)
 def test_killed_process_holds_no_lock(path, survivor, way, start):
-    """Its file is taken over with its content, although a child survives."""
+    """Another process takes over the file, although a child survives."""
     call = 'Lock(path, "content")' if way == "Lock" else "try_lock(path)"
     holder = start(f"lock = {call}\n{SURVIVORS[survivor]}{WAIT}")
     assert holder.stdout.readline() == "held\n"

@@ -57,7 +57,7 @@ def change(struct, name):
 
 
 def test_change_of_any_field_is_noticed_by_name(model):
-    """Every array with elements, and every member of `opt`, `vis` and `stat`."""
+    """Fields are arrays and members of `opt`, `vis` and `stat`."""
     looks = Looks(model)
     looks.follow(view())
     arrays = [name for name in array_names() if getattr(model, name).size]

@@ -41,7 +41,6 @@ def test_eight_threads_record_into_one_directory(tmp_path, make_corridor):
 
 @pytest.mark.parametrize("send", [pickle.dumps, copy.copy, copy.deepcopy])
 def test_monitor_cannot_be_pickled_or_copied(send, tmp_path, corridor):
-    """The error says where to make it instead."""
     with Monitor(corridor, tmp_path, video_callable=False) as monitor:
         with pytest.raises(NotPicklable, match="inside the function") as caught:
             send(monitor)

@@ -116,7 +116,6 @@ def test_invalid_action_is_refused(write, action):
 
 
 def test_mjcf_environment_is_recorded_from_states(write):
-    """Also wrapped, unless `render()` is overridden."""
     path = write(cameras=FIXED)
     scenes = gymnasium_scenes(make_mjcf(path, EnvironmentOptions()))
     assert scenes.obstacle is None

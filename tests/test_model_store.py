@@ -86,7 +86,7 @@ def sphere():
 
 
 def test_same_content_makes_the_same_files_once(directory, tmp_path, mjcf):
-    """For all writers at any time; existing files stay untouched."""
+    """Existing files stay untouched."""
     authored = authored_from_file(mjcf)
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     facts = store_model(directory, model, authored)
@@ -106,7 +106,6 @@ def test_same_content_makes_the_same_files_once(directory, tmp_path, mjcf):
 
 
 def test_storing_can_be_tried_again_after_a_full_disk(directory):
-    """Each error names the file."""
     store = ModelStore(directory)
     with file_size_limit(100):
         facts = store.add(sphere())
@@ -121,7 +120,7 @@ def test_storing_can_be_tried_again_after_a_full_disk(directory):
 
 
 def test_another_version_compiles_the_sources(directory, mjcf):
-    """Without the original files, with changes made to the compiled model."""
+    """The original files may be gone; changes to the model are applied again."""
     authored = authored_from_file(mjcf)
     assert authored.main == "model/main.xml"
     assert sorted(authored.files) == [
@@ -257,7 +256,6 @@ def test_facts_cannot_name_other_files(directory, name):
 
 
 def test_compiled_bomb_is_not_unpacked(directory):
-    """It is read up to the recorded size."""
     facts = store_model(directory, sphere())
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
     with pytest.raises(UnreadableFile, match="it contains more than the recorded"):

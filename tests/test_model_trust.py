@@ -96,7 +96,6 @@ def test_trust_list_is_private_to_its_user(trust_list, become_another_user):
 
 
 def test_concurrent_writers_lose_no_line(trust_list):
-    """Also after a line that was cut off."""
     note_models([DIGEST])
     with trust_list.open("a") as file:
         file.write(OTHER[:30])
@@ -132,7 +131,7 @@ def test_trust_list_forgets_the_oldest_models(trust_list, monkeypatch):
 def test_unwritable_home_uses_the_fallback_list(
     tmp_path, fallback, monkeypatch, caplog
 ):
-    """Without a warning; its models stay trusted later."""
+    """There is no warning, and its models stay trusted later."""
     note_models([DIGEST])
     with file_size_limit(70):
         note_models([OTHER])

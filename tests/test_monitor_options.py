@@ -102,7 +102,6 @@ INVALID = {
     [(name, *case) for name, cases in INVALID.items() for case in cases],
 )
 def test_invalid_options_leave_no_files(name, options, error, words, tmp_path):
-    """The environment stays open."""
     env = ENVIRONMENTS[name]()
     with pytest.raises(getattr(mjrec, error), match=words):
         mjrec.Monitor(env, tmp_path / "new", **options)

@@ -51,7 +51,7 @@ def test_force_deletes_monitor_files_only(tmp_path, names):
 
 
 def test_resume_continues_after_the_highest_number(tmp_path):
-    """Of all runs, or of those with its uid; "join" reads no files."""
+    """A uid limits this to its own runs; "join" reads no files."""
     write_video(tmp_path, "0.1", 0)
     # Videos alone count as recordings.
     with pytest.raises(ExistingRecordings, match=r"(?s)mp4.*resume=True.*force"):
@@ -93,7 +93,7 @@ def test_invalid_next_number_is_an_error(tmp_path, number):
 
 
 def test_resume_over_another_environment_is_an_error(tmp_path):
-    """Also of an open or killed monitor; the error names both."""
+    """The error names both, also for an open or killed monitor."""
     again = {"resume": True, "env_id": ANOTHER}
     with monitor(tmp_path / "a") as env:
         with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
@@ -117,7 +117,7 @@ def test_resume_over_another_environment_is_an_error(tmp_path):
     ],
 )
 def test_unwritable_directory_is_an_error(path, reason, tmp_path):
-    """It names the path; a full disk leaves no directory."""
+    """A full disk leaves no directory."""
     (tmp_path / "file").touch()
     with pytest.raises(DirectoryNotWritable, match=reason):
         monitor(Path(path.format(tmp_path)))

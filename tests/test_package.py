@@ -30,7 +30,6 @@ def wheel(tmp_path_factory):
 
 
 def test_wheel_contains_exactly_the_package(wheel):
-    """Templates and tables too; no tests or benchmarks."""
     package = {
         str(path.relative_to(SOURCE))
         for path in (SOURCE / "mjrec").rglob("*")
@@ -54,7 +53,7 @@ def test_metadata_has_license_version_and_typing(wheel):
 
 @pytest.mark.wheel
 def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path):
-    """In an environment of the wheel and its dependencies, far from the sources."""
+    """The environment holds the wheel and its dependencies alone."""
     python = os.environ.get("MJREC_TEST_WHEEL")
     if python is None:
         pytest.fail("scripts/test --all names an environment with the wheel.")

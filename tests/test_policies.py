@@ -87,7 +87,7 @@ def test_random_actions_depend_on_the_episode_seed_alone(space):
     ],
 )
 def test_zero_is_the_action_nearest_to_zero(space, zero):
-    """Of the space's type, also after a caller wrote into the action."""
+    """A caller may write into an earlier action."""
     policy = load_policy("zero", environment_with(spaces.Tuple([space])))
     for _ in range(2):
         policy.reset(SEEDS)
@@ -99,7 +99,7 @@ def test_zero_is_the_action_nearest_to_zero(space, zero):
 
 
 def test_dm_env_actions_are_drawn_within_their_bounds():
-    """Also nested ones; unbounded numbers are drawn around zero."""
+    """Unbounded numbers are drawn around zero."""
     specs = pytest.importorskip("dm_env").specs
     spec = {
         "bounded": specs.BoundedArray((2,), np.float32, [-1, 2.1], [0, 3]),
@@ -200,7 +200,7 @@ def test_functions_classes_and_calls_are_policies(write):
 
 
 def test_predict_is_called_as_stable_baselines3_does():
-    """Deterministic, with state and episode start."""
+    """The call is deterministic and passes state and episode start."""
 
     class Model:
         calls = []  # noqa: RUF012  one object
@@ -256,7 +256,6 @@ def test_invalid_policy_names_alternatives_or_the_error(write, text, name, kind,
 
 
 def test_policy_errors_name_call_and_line(write):
-    """Whether it is being built, reset or called."""
     write(
         "class Late:\n"
         "    def __init__(self, environment): pass\n"

@@ -52,7 +52,6 @@ def test_missing_library_names_the_extra(name, library, extra, tmp_path, monkeyp
     ],
 )
 def test_saved_model_acts_deterministically(algorithm, env_id, options, tmp_path):
-    """Within its bounds, also for float64 observations."""
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     env = gymnasium.make(env_id)
     small = {"seed": 0, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
@@ -117,7 +116,7 @@ def export_network(directory, kind):
 @pytest.mark.stable_baselines3
 @pytest.mark.parametrize("kind", ["pt", "pt2", "onnx"])
 def test_network_gets_float32_rows(kind, tmp_path):
-    """For observations of any structure; actions are clipped to their bounds."""
+    """Actions are clipped to their bounds."""
     env = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
     policy = load_policy(str(export_network(tmp_path, kind)), env)
     policy.reset(SEEDS)

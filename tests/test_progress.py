@@ -24,7 +24,6 @@ LINES = [
 def test_log_gets_a_line_after_5_seconds_then_every_30(
     where, monkeypatch, caplog, capsys
 ):
-    """A quiet console gets none."""
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: clock.now))
     console = None

@@ -84,7 +84,7 @@ def test_short_process_exits_silently():
 
 @pytest.mark.parametrize("way", ["child", "no child", "child that fails"])
 def test_packages_equal_those_of_importlib(way, tmp_path, monkeypatch):
-    """Sorted by name; without a working child this process lists them."""
+    """Without a working child this process lists them."""
     program = tmp_path / "python"
     if way == "child that fails":
         program.write_text("#!/bin/sh\necho '{}'\nexit 3\n")
@@ -114,7 +114,7 @@ INSTALLER_LINES = [
 
 
 def test_package_hashes_cover_the_wheel_alone(tmp_path, monkeypatch):
-    """In any order, without an installer's lines, for the first version on the path."""
+    """The first version on the path counts; an installer's lines do not."""
     for version in ("1.5", "3.0"):
         info = tmp_path / version / f"gripper-{version}.dist-info"
         info.mkdir(parents=True)

@@ -87,7 +87,7 @@ def usual(page, videos):
 
 
 def test_videos_play(usual):
-    """At their size and duration, one at a time, by mouse and keyboard."""
+    """Only one plays at a time."""
     players = usual.locator("video")
     expect(players).to_have_count(0)
     buttons = usual.get_by_role("button", name="Play dm_control/")
@@ -109,7 +109,7 @@ def test_videos_play(usual):
 
 @parametrize("single_file", [False, True])
 def test_report_of_a_recording_plays(page, tmp_path, make_corridor, play, single_file):
-    """Without the recording itself, which is deleted."""
+    """The recording itself is deleted first."""
     directory = tmp_path / "recordings #1"
     with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
         play(monitor, 3, seed=0)

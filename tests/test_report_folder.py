@@ -87,7 +87,6 @@ def test_command_writes_a_report_of_several_directories(tmp_path, capsys, monkey
 
 
 def test_posters_show_the_middle_frame(recordings):
-    """At most 640 pixels wide, in the video's colors."""
     sizes = [(400, 800), (48, 64)]
     for video, size in zip(sorted(recordings.glob("*.mp4")), sizes, strict=True):
         with mjrec.VideoWriter(video, fps=10) as writer:
@@ -129,7 +128,6 @@ def test_hostile_env_id_is_text_and_no_file_name(tmp_path):
 
 
 def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
-    """Nothing of the older one is left."""
     (tmp_path / "report").mkdir()
     write_report(recordings, tmp_path / "report")
     run = tmp_path / "run"
@@ -159,7 +157,6 @@ def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
 def test_other_files_are_not_replaced(
     recordings, tmp_path, target, mine, options, words
 ):
-    """The error names the file in the way."""
     write_report(recordings, tmp_path / "report")
     (tmp_path / mine).parent.mkdir(exist_ok=True)
     (tmp_path / mine).write_text("mine")
@@ -216,7 +213,7 @@ def test_single_file_embeds_media_up_to_its_limit(recordings, tmp_path):
 
 
 def test_replay_option_adds_three_pages_in_3d(tmp_path):
-    """Those of the best, median and worst episode."""
+    """They show the best, median and worst episode."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
     record(env, tmp_path / "run", 4, height=48, width=64, video_callable=lambda _: True)

@@ -155,7 +155,6 @@ def test_page_of_many_episodes_holds_a_selection():
 
 
 def test_report_without_episodes_is_a_page_without_figures():
-    """So is one of a task whose episodes failed."""
     assert "0 tasks, 0 episodes, 0 videos" in page_of(ReportContents())
     page = page_of(contents(task("a", [1.0], failures={0: "PolicyError: NaN"})))
     assert "PolicyError: NaN" in page
@@ -172,7 +171,6 @@ def test_report_without_episodes_is_a_page_without_figures():
     ids=len,
 )
 def test_any_returns_make_a_small_figure(draw, returns):
-    """Every coordinate is finite, also for equal or extreme returns."""
     for seeds in (1, min(100, len(returns))):
         svg = draw(task("a", returns, seeds=seeds, score_range=None), key="k")
         assert len(svg) < 40_000

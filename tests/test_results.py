@@ -98,7 +98,7 @@ def test_merge_sorts_episodes_by_time(tmp_path):
 
 
 def test_monitors_keep_their_order_in_all_lists(tmp_path, caplog):
-    """Also without manifest or episodes; without any monitor the result is None."""
+    """A directory without monitors has no results."""
     assert mjrec.load_results(tmp_path / "missing") is None
     assert mjrec.load_results(str(tmp_path)) is None
     assert f"directory {tmp_path / 'missing'} does not exist" in caplog.text
@@ -129,7 +129,7 @@ def test_newest_env_info_wins_with_one_warning(tmp_path, caplog):
 
 
 def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
-    """Also in a moved directory; one warning names all missing videos."""
+    """One warning names all missing videos."""
     pairs = [(f"v{i}.mp4", f"v{i}.meta.json") for i in range(4)]
     (tmp_path / "old").mkdir()
     write_saved(tmp_path / "old", "1.7", videos=pairs[:1])
@@ -202,7 +202,6 @@ def test_pending_videos_are_deferred_and_missing(tmp_path, has_journal):
 
 
 def test_gym_episodes_have_gym_facts_only(tmp_path):
-    """Also where gym died before its manifest."""
     write_saved(tmp_path, "0.7", 1, 2, types="te").unlink()
     text, meta = (video(tmp_path, "0.7", 1, end) for end in (".json", ".meta.json"))
     _, episode = mjrec.iter_episodes(tmp_path)

@@ -76,7 +76,7 @@ def assert_same(ours, gyms, *, but=()):
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_directories_of_gym_are_read(name, monkeypatch):
-    """As gym reads them, except for known errors of gym."""
+    """Results equal gym's, except for known errors of gym."""
     monkeypatch.chdir(DATA)
     version, _, case = name.partition("/")
     ours, gyms = mjrec.load_results(Path(name)), recorded_answer(name)
@@ -119,7 +119,6 @@ def test_recorded_gym_reads_our_files(tmp_path, monkeypatch):
 
 
 def test_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
-    """Those of gym 0.21, and `mjrec`."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 1)
     for kind, added in (("manifest", {"mjrec"}), ("stats", set())):
@@ -162,7 +161,6 @@ def test_gym_answers_as_recorded(ask_gym, tmp_path, monkeypatch):
 
 @pytest.mark.old_gym
 def test_gym_reads_files_of_monitors(ask_gym, tmp_path, corridor, make_corridor, play):
-    """Of two runs; a NaN becomes null without harm to others."""
     stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
     write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
     [gyms] = ask_gym(tmp_path).values()

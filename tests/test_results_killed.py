@@ -155,7 +155,6 @@ def test_journal_replaces_damaged_files(tmp_path, pattern, content, caplog):
 
 
 def test_statistics_replace_a_damaged_journal(tmp_path, caplog):
-    """A link is named and never followed."""
     details = {"first_episode_id": 1, "next_episode_id": 3}
     manifest = write_saved(tmp_path, "0.7", 1, 2, details=details)
     journal = write_journal(tmp_path, "0.7")

@@ -82,7 +82,6 @@ def test_goal_is_drawn_and_nothing_else_changes(mode):
 
 
 def test_unknown_render_is_not_called():
-    """Neither is a known one that changes nothing."""
     from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
 
     class Robot(MujocoFetchReachEnv):

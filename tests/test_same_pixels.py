@@ -142,7 +142,7 @@ def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
 
 
 def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
-    """Arguments of the environment, then changes to its viewer within an episode."""
+    """The viewer changes within an episode."""
     monkeypatch.chdir(tmp_path)  # for MuJoCo's log of full scenes
     env = make(
         "Ant-v5",

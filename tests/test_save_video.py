@@ -25,7 +25,6 @@ def shown(path):
 
 
 def test_default_is_the_capped_cubic_schedule(tmp_path, names):
-    """With Gymnasium's names and every frame."""
     for episode in (2, 8, 999, 1000):
         mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
     assert names(tmp_path) == ["rl-video-episode-1000.mp4", "rl-video-episode-8.mp4"]

@@ -43,7 +43,7 @@ def second_names(directory):
 
 @pytest.mark.parametrize("has_hard_links", [True, False])
 def test_all_files_of_an_episode_have_second_names(video, monkeypatch, has_hard_links):
-    """They are links; a missing one is made again."""
+    """A missing link is made again."""
 
     def refuse(*_):
         raise OSError("no links here")
@@ -75,7 +75,6 @@ def test_copies_of_links_are_still_second_names(video, tmp_path, caplog):
 
 
 def test_foreign_file_of_that_name_stays(video, caplog):
-    """A warning names it."""
     mine = video.with_name(f"{SECOND}.mp4")
     mine.write_text("mine")
     give_second_names(video)
@@ -89,7 +88,7 @@ def test_foreign_file_of_that_name_stays(video, caplog):
 
 @pytest.mark.parametrize("way", ["hardlink_to", "symlink_to"])
 def test_clearing_removes_links_to_videos(way, video):
-    """Also without their metadata; links of other names stay."""
+    """Links of other names stay."""
     getattr(video.with_name(f"{SECOND}.mp4"), way)(video)
     os.link(video, video.with_name("my favourite.mp4"))
     video.with_suffix(".meta.json").unlink()

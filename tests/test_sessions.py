@@ -53,7 +53,7 @@ def test_deferred_drawing_needs_no_gl(options, tmp_path):
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
 def test_missing_gl_error_suggests_deferred_drawing(tmp_path, render):
-    """Unless live frames were requested; nothing is written."""
+    """For live frames there is no such advice."""
     out = tmp_path / "out"
     with pytest.raises(GLError, match="Nothing renders here") as raised:
         list(record_session(session(out, render=render)))

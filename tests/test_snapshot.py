@@ -181,7 +181,7 @@ def test_restored_snapshot_gives_the_same_scene(xml):
     ],
 )
 def test_invalid_snapshot_is_refused(name, value, words):
-    """MuJoCo would read memory out of bounds."""
+    """MuJoCo would read out of bounds."""
     model, data = simulated(TENDONS)
     row = row_of(model, data)
     if isinstance(value, int):

@@ -65,7 +65,7 @@ def mapped(request, monkeypatch):
 
 
 def test_counted_rows_are_readable_at_once(logs, path, mapped):
-    """Also where the tail wraps, and for an open reader; closing leaves the log."""
+    """An open reader keeps its rows; closing leaves only the log."""
     span = write(logs, 2)
     journal, log, tail, _ = files_of(path.parent)
     assert tail.exists() == mapped
@@ -129,7 +129,7 @@ def test_model_changes_keep_names_types_and_values(logs, path):
 
 
 def test_reader_sees_whole_recordings_beside_a_writer(tmp_path):
-    """So does each change to the model, though the tail wraps with every fourth row."""
+    """The tail wraps with every fourth row."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record():
@@ -230,7 +230,6 @@ def test_killed_process_loses_no_counted_row(logs, path, mapped, moment):
 
 @pytest.mark.parametrize("written", [0, 5, 8 * ROW])
 def test_interrupted_write_continues(logs, path, monkeypatch, written):
-    """After Ctrl-C at any byte, each row is there once."""
     last = 2 * CAPACITY - 1
     span = write(logs, last)
     real = os.pwrite
@@ -289,7 +288,7 @@ def test_death_in_a_journal_line_loses_only_that_line(logs, tmp_path, line, part
 
 
 def test_truncated_log_reports_lost_rows(logs, path):
-    """Also while it is read; other rows in their place are an error."""
+    """Other rows in their place are an error."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -340,7 +339,6 @@ def test_stale_or_foreign_tail_adds_no_row(logs, path, tail):
 
 
 def test_full_disk_when_a_log_begins_leaves_nothing(logs, path):
-    """Neither the tail nor the journal finds room; with room again it begins."""
     long = {"text": "x" * 20_000}
     for room, facts in ((0, FACTS), (100, FACTS), (4096, FACTS), (9000, long)):
         with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
@@ -394,7 +392,6 @@ def test_full_disk_costs_no_recorded_step(logs, path, mapped):
 
 
 def test_model_change_can_be_added_again_after_a_full_disk(logs, path):
-    """The error names the file; earlier changes stay."""
     span = write(logs, 1)
     span.log.add_change(model_change(2))
     write(logs, 2, first=2, span=span)
@@ -411,7 +408,7 @@ def test_model_change_can_be_added_again_after_a_full_disk(logs, path):
 
 
 def test_new_log_begins_for_other_rows_and_long_logs(logs, tmp_path, monkeypatch):
-    """So does each recording that may be deleted alone; changes count as rows."""
+    """Each recording that may be deleted alone has its own log."""
     other = row_dtype(state=STATE, action=np.dtype(("<i4", ACTION.shape)))
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
     write(logs, 5, episode=0)
@@ -457,7 +454,7 @@ def test_log_is_removed_after_its_last_recording(logs, tmp_path):
 
 
 def test_log_of_an_open_monitor_is_not_removed(logs, path, monkeypatch):
-    """Not even where a recording begins during the check."""
+    """A recording may begin during the check."""
     lock = Lock(path.parent / lock_name(INFIX), "")
     write(logs, 3)
     drop(path)
@@ -481,7 +478,7 @@ def test_log_of_an_open_monitor_is_not_removed(logs, path, monkeypatch):
 
 @pytest.mark.parametrize("more", [-1, 1])
 def test_new_journal_replaces_a_removed_one_of_the_same_name(tmp_path, more):
-    """It may be shorter or longer, as where `force` empties a directory."""
+    """`force` empties a directory like this."""
     for number in range(4):
         logs, count = new_logs(tmp_path, INFIX), 4 + more * number
         for each in range(count):

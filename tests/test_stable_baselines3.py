@@ -73,7 +73,6 @@ def test_training_is_recorded(tmp_path):
 
 
 def test_stable_baselines3_logs_episode_info(tmp_path):
-    """Without a monitor of its own."""
     options = {"episode_info": True, "video_callable": False}
     venv = DummyVecEnv([lambda: make_env(tmp_path, **options)])
     model = make_ppo(venv).learn(STEPS)
@@ -159,7 +158,7 @@ def test_evaluation_is_recorded(tmp_path):
 
 
 def test_files_of_several_runs_are_read_together(tmp_path):
-    """In the order of their ends, with NaN, infinity, and a run without episodes."""
+    """They are in the order of their ends."""
     tracker = MonitorCsvTracker()
     runs = [
         Run(directory=tmp_path, infix=f"{i}.1", env_id="x", env_index=i)

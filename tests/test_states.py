@@ -26,7 +26,6 @@ FULL = """
 
 @pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
 def test_state_words_equal_mujocos_state(xml):
-    """With mocap bodies, user data, activations and applied forces."""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     data.mocap_pos[:] = 7
@@ -41,7 +40,6 @@ def test_state_words_equal_mujocos_state(xml):
 
 
 def test_components_are_named_after_arrays_of_mjdata():
-    """Empty components are left out."""
     equality = '<equality><weld body1="moved" body2="free"/></equality>'
     model = mujoco.MjModel.from_xml_string(FULL.format(equality=equality))
     data = mujoco.MjData(model)

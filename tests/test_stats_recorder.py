@@ -27,7 +27,6 @@ def run_episode(recorder, rewards, *, end=True):
 
 
 def test_only_complete_episodes_are_written(recorder):
-    """A closed recorder refuses."""
     with pytest.raises(ResetNeeded, match="Env-v0 before the first reset"):
         recorder.before_step(None)
     before = time.time()
@@ -55,7 +54,6 @@ def test_only_complete_episodes_are_written(recorder):
     ],
 )
 def test_rewards_add_up_in_float64(recorder, rewards, total):
-    """For numbers of any kind; the file is valid JSON."""
     run_episode(recorder, rewards)
     recorder.close()
     json.loads(Path(recorder.path).read_text(), parse_constant=pytest.fail)
@@ -64,7 +62,6 @@ def test_rewards_add_up_in_float64(recorder, rewards, total):
 
 
 def test_type_takes_effect_at_the_next_reset(recorder):
-    """Other types and invalid rewards are errors."""
     run_episode(recorder, [0.0], end=False)
     recorder.type = "e"
     recorder.after_step(None, 0.0, True, {})

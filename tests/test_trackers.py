@@ -37,7 +37,6 @@ def test_import_loads_no_service_package():
     ],
 )
 def test_missing_package_names_the_extra(package, call, tmp_path):
-    """The constructor raises before anything is written."""
     code = f"import sys\nsys.modules[{package!r}] = None\n"
     code += f"import mjrec.trackers as t\nt.{call}"
     error = run_python(code, cwd=tmp_path, status=1).stderr
@@ -77,7 +76,7 @@ def test_header_and_rows(run):
 
 
 def test_each_run_has_its_own_file(run, tmp_path, monkeypatch):
-    """In the directory that a relative path named at construction."""
+    """A relative path is resolved at construction."""
     (tmp_path / "logs").mkdir()
     monkeypatch.chdir(tmp_path)
     tracker = MonitorCsvTracker("logs")

@@ -83,7 +83,6 @@ def test_video_is_logged_as_an_animated_gif(finished):
 
 
 def test_runs_have_their_own_names(finished, tmp_path):
-    """Sub-environments, and two directories with one infix, share a `log_dir`."""
     changes = [
         {"env_index": 0},
         {"env_index": 1, "infix": "1.4711"},

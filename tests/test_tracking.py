@@ -67,7 +67,7 @@ def test_tracker_receives_episodes_and_live_videos_in_order(tmp_path):
 
 
 def test_tracker_receives_each_deferred_video_once_finished(tmp_path):
-    """In `close` at the latest; pending videos never."""
+    """It never receives pending videos."""
     tracker, pending = RecordingTracker(), RecordingTracker()
     record(tmp_path, tracker)
     videos = tracker.of("video")

@@ -42,7 +42,6 @@ def in_both_forms(path):
 
 
 def test_trajectory_has_all_arrays_in_documented_shapes(tmp_path):
-    """An unknown component is an error that lists the components."""
     path, arrays = record(tmp_path, max_fps=10)
     qpos = arrays.pop("qpos")
     for trajectory in in_both_forms(path):

@@ -101,7 +101,7 @@ def check_changes(content):
     ],
 )
 def test_finished_file_equals_its_log(path, steps, every, dtype):
-    """Bit for bit, NaN payloads included; unrecorded arrays are absent."""
+    """NaN payloads are kept, and unrecorded arrays are absent."""
     facts = {**FACTS, "long": "x" * 10**5}
     record(path, steps, every=every, dtype=dtype, facts=facts)
     assert finish_trajectory(path) == path
@@ -115,7 +115,6 @@ def test_finished_file_equals_its_log(path, steps, every, dtype):
 
 
 def test_killed_episode_records_its_reason(path):
-    """Also before its first row; rewards are summed in order."""
     for steps in (-1, 12):
         record(path, steps, ended=False)
         content = read(finish_trajectory(path))
@@ -130,7 +129,7 @@ def test_killed_episode_records_its_reason(path):
 
 
 def test_h5py_reads_every_array_by_name(path):
-    """With the format of HDF5 1.10 and only its built-in filters."""
+    """The file has HDF5 1.10's format and only built-in filters."""
     record(path)
     content = read(path)
     finish_trajectory(path)
@@ -194,7 +193,6 @@ def test_recording_finished_during_opening_is_read(path, monkeypatch):
 
 
 def test_full_disk_leaves_only_the_log(path):
-    """With room again, finishing succeeds."""
     record(path)
     for room in (0, 700, 5000):
         error = pytest.raises(FileNotWritten, match=r"\.h5: File too large")
@@ -232,7 +230,7 @@ def test_memory_does_not_grow_with_the_episode(path):
 
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_leaves_only_the_log(path, monkeypatch):
-    """Also inside a callback of HDF5, where an exception would crash."""
+    """An exception inside a callback of HDF5 would crash."""
     record(path, 600, dtype=LONG)
     usual = trajectory_hdf5._Unfailing.write
 
@@ -309,7 +307,6 @@ def record_several(directory, *episodes):
 
 
 def test_bundle_equals_single_files(tmp_path):
-    """Dataset by dataset, for mjrec and for h5py."""
     numbers = (3, 4, 5, 9, 12)
     singles, bundled_ones = (record_several(tmp_path / name, *numbers) for name in "ab")
     assert bundle_trajectories(bundled_ones) == {}
@@ -382,7 +379,6 @@ def test_directory_lists_bundled_trajectories(tmp_path):
     ],
 )
 def test_invalid_bundle_index_names_no_episode(tmp_path, kind, episodes):
-    """It takes no memory, and no group leads elsewhere."""
     [path] = record_several(tmp_path, 1)
     index = f'{{"format": "{kind}", "version": 1, "episodes": {episodes}}}'
     bundle_of(path).write_bytes((index if kind else episodes).encode("latin-1") + b"\n")

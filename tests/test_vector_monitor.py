@@ -100,7 +100,7 @@ def test_sixty_four_sub_environments(tmp_path):
 
 
 def test_each_monitor_reports_its_own_failures(tmp_path):
-    """Although the sub-environments share the rendering processes."""
+    """The sub-environments share the rendering processes."""
     env = mjrec.Monitor(pendulums(2), tmp_path, workers=1, quality="draft")
     good, bad = env.monitors
     path_of(bad, 0, "mp4").mkdir()
@@ -159,7 +159,7 @@ def test_failing_constructor_leaves_no_files(make_corridor, tmp_path, names, res
 
 @pytest.mark.parametrize("kind", ["sync", "one object"])
 def test_error_is_noted_in_all_running_episodes(corridors, tmp_path, kind):
-    """Their metadata has it; steps before reset and pickling are errors."""
+    """Steps before reset and pickling are errors as well."""
     vector = corridors(kind=kind)
 
     def explode(action):
@@ -315,7 +315,7 @@ def monitored_hopper(directory):
     [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
 )
 def test_monitors_inside_subprocesses_record_whole_videos(tmp_path, context, mode):
-    """Also in daemonic processes, from states."""
+    """Subprocesses are daemonic."""
     make = monitored_hopper(tmp_path)
     env = AsyncVectorEnv([make, make], context=context, autoreset_mode=mode)
     workers = {process.pid for process in env.processes}
