@@ -1,42 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal keeps every completed episode."""
 
-import dataclasses
 import json
 import math
 import re
 
 import pytest
 from full_disk import file_size_limit
+from result_files import entry, write_journal
 
 from mjrec.errors import ClosedError, FileNotWritten
-from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
+from mjrec.formats.journal import JournalWriter, read_journal
 
-ENTRY = JournalEntry(
-    *(3, 200, 1.5, "e", 90.25, 91.5, 7, {"x": [1, 2]}),
-    terminated=False,
-    truncated=True,
-    success=None,
-    chosen=True,
-    recording="live",
-)
-NEXT = dataclasses.replace(ENTRY, episode_id=4, seed=None, options=None)
+INFIX = "0.1"
+FACTS = {"type": "e", "options": {"x": [1, 2]}, "chosen": True, "recording": "live"}
+ENTRY, NEXT = entry(3, **FACTS), entry(4, **{**FACTS, "options": None, "seed": None})
 
 
 @pytest.fixture
 def path(tmp_path):
-    return tmp_path / "openaigym.episodes.0.1.jsonl"
+    return tmp_path / f"openaigym.episodes.{INFIX}.jsonl"
 
 
-def write(path, *entries, **options):
-    writer = JournalWriter(path, **options)
-    for entry in entries:
-        writer.append(entry)
-    writer.close()
-
-
-def entry_with(**facts):
-    return dataclasses.replace(ENTRY, **facts)
+def write(path, *entries):
+    write_journal(path.parent, INFIX, *entries)
 
 
 def read(path):
@@ -51,22 +38,22 @@ def read(path):
     ],
 )
 def test_entries_are_read_back(path, facts):
-    writer = JournalWriter(path)
+    writer, first = JournalWriter(path), entry(3, **{**FACTS, **facts})
     assert not path.exists()
-    writer.append(entry_with(**facts))
-    assert repr(read(path)) == repr([entry_with(**facts)])
+    writer.append(first)
+    assert repr(read(path)) == repr([first])
     writer.append(NEXT)
     writer.close()
     with pytest.raises(ClosedError, match="jsonl"):
         writer.append(NEXT)
     # The text of NaN equals itself.
-    assert repr(read(path)) == repr([entry_with(**facts), NEXT])
+    assert repr(read(path)) == repr([first, NEXT])
     assert not re.search("NaN|Infinity", path.read_text())
 
 
 def test_options_of_any_type_and_size_are_written(path):
     """The journal has their repr, cut to a limit."""
-    write(path, entry_with(options={"lock": re}), entry_with(options="x" * (1 << 24)))
+    write(path, entry(3, options={"lock": re}), entry(3, options="x" * (1 << 24)))
     first, second = (json.loads(line) for line in path.read_text().splitlines())
     assert "module 're'" in first["options"]["lock"]["repr"]
     assert second["options"]["repr"].startswith("'xx")
@@ -75,7 +62,7 @@ def test_options_of_any_type_and_size_are_written(path):
 
 def test_cut_last_line_is_left_out(path, caplog):
     """One warning names its number if it is known; writing goes on."""
-    later = entry_with(episode_id=5)
+    later = entry(5)
     write(path, ENTRY, NEXT)
     whole = path.read_bytes()
     first, second = whole.splitlines(keepends=True)
@@ -105,8 +92,8 @@ def test_cut_last_line_is_left_out(path, caplog):
     ],
 )
 def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
-    late = entry_with(episode_id=10**14)
-    write(path, late, NEXT, entry_with(reward=9.0, episode_id=4), ENTRY, late)
+    late = entry(10**14, length=10, start_time=99.5, end_time=100.0)
+    write(path, late, NEXT, entry(4, reward=9.0), ENTRY, late)
     first, *rest = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + damage + b"".join(rest))
     # The first of two lines with one number counts, in any order of numbers.
@@ -144,7 +131,7 @@ def test_failed_line_is_written_before_the_next_one(path):
     assert len(path.read_bytes().splitlines()) == 1
     with path.open("ab") as file:
         file.write(b'{"episode_id": 4, "le')
-    third = dataclasses.replace(NEXT, episode_id=NEXT.episode_id + 1)
+    third = entry(5)
     writer.append(third)
     assert read(path) == [ENTRY, NEXT, third]
     # A removed journal is an error; the next entry begins another.
