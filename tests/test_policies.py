@@ -276,17 +276,3 @@ def test_policy_errors_name_call_and_line(write):
         load("Early")
     with pytest.raises(mjrec.PolicyError, match=r"Alone.* Give it a parameter"):
         load("Alone")
-
-
-def test_objects_are_policies_without_a_name():
-    class Still:
-        def __init__(self, environment, value=0):
-            self.action = np.full(environment.action_space.shape, value)
-
-        def __call__(self, observation):
-            return self.action
-
-    assert policy_from(lambda _: [0.5, 0], "half", BOX)(None) == [0.5, 0]
-    assert policy_from(Still, "Still", BOX, {"value": 1})(None).tolist() == [1, 1]
-    with pytest.raises(mjrec.PolicyError, match="mine is 3"):
-        policy_from(3, "mine", BOX)
