@@ -7,6 +7,7 @@ Each is read in a fork with a gigabyte of memory (`hostile_reading`).
 import contextlib
 import gzip
 import hashlib
+import io
 import json
 import os
 import re
@@ -300,7 +301,6 @@ NOISE = np.random.default_rng(1).bytes(10_000)
 BOMB = gzip.compress(bytes(1 << 28))
 GZIP = [
     partial(replace_compiled_model, NOISE, gzip.compress(NOISE)),
-    partial(replace_compiled_model, CONTENT, BOMB),
     partial(replace_compiled_model, CONTENT, BOMB, bytes=(1 << 31) - 1),
     *(
         partial(replace_compiled_model, CONTENT, packed)
@@ -331,6 +331,12 @@ def npy(header):
     return b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text + bytes(64)
 
 
+def field(name, value):
+    buffer = io.BytesIO()
+    np.save(buffer, value)
+    return {f"fields/{name}.npy": buffer.getvalue()}
+
+
 MAIN = "source/main.xml"
 VALID_ZIP = {MAIN: SPHERE.encode()}
 HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}")
@@ -342,6 +348,12 @@ ZIP = {
     "nested too deeply": {"contents.json": b"[" * 100_000},
     "other": {"contents.json": b'{"format": 1, "main": "other"}'},
     "dict": {"contents.json": b'{"format": 1, "main": {}}'},
+    # An index that MuJoCo would trust, objects, and names of other things.
+    "set from": field("geom_bodyid", np.array([10**6], np.int32)),
+    "no model field .opt": field("opt.__class__", np.zeros(())),
+    "Object arrays cannot be loaded": field("geom_rgba", np.array([[None] * 4])),
+    "another model": field("geom_rgba", np.zeros((9, 4), np.float32)),
+    "no model field .aura": field("aura", np.zeros(1)),
 }
 INSIDE = "<mujoco><worldbody>%s</worldbody></mujoco>"
 # A megabyte of names, to search 400 million times.
@@ -373,6 +385,11 @@ ATTACKS = [
     ("spans", partial(replace_first_line, b"[" * 10**7 + b"\n"), "does not give"),
     *((".looks", partial(write_change, h), "change to the model") for h in CHANGES),
     *(("mjb.gz", attack, "") for attack in GZIP),
+    ("mjb.gz", partial(replace_compiled_model, CONTENT, BOMB), "more than the record"),
+    (
+        *("mjb.gz", partial(replace_compiled_model, CONTENT, BOMB, bytes=1 << 50)),
+        "recorded size is",
+    ),
     *(("zip", partial(write_zip, {**VALID_ZIP, **m}), e) for e, m in ZIP.items()),
     ("zip", partial(write_zip, VALID_ZIP, duplicate=MAIN), "is not XML"),
     *(("zip", partial(write_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
