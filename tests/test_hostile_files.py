@@ -231,6 +231,11 @@ def linked_field(file):
     add_change(file)["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
 
 
+def linked_rewards(file):
+    del file["rewards"]
+    file["rewards"] = h5py.ExternalLink("other.h5", "/x")
+
+
 def object_field(file):
     group, kind = add_change(file), h5py.string_dtype()
     group.create_dataset("x", data=[b"cos\nsystem"], dtype=kind)
@@ -247,6 +252,31 @@ HDF5 = [
     (linked_field, "no 'geom_rgba' of its own"),
     (object_field, "not a valid dtype"),
     (lambda file: file.attrs.create("format_version", True), "wrong type"),
+    (lambda file: file.attrs.update(format="mjrec trajectory"), "has the wrong type"),
+    (lambda file: file.attrs.update(format=np.bytes_(b"hdf5")), "not a trajectory"),
+    (lambda file: file.attrs.update(format_version=np.int64(2)), "update mjrec"),
+    (lambda file: file.attrs.update(facts=np.bytes_(b"{}")), "its facts are damaged"),
+    (
+        lambda file: file.create_dataset("actions", data=np.zeros((3, 3))),
+        "the same number of steps",
+    ),
+    (replaced("states", data=np.zeros(5, "f4,f4")), "components that are not float64"),
+    (replaced("rewards", data=["a"] * 4), "not a valid dtype"),
+    (replaced("rewards", data=np.zeros((4, 2))), "rewards have"),
+    (replaced("snapshots", data=np.zeros(5)), "the snapshot of a row"),
+    (replaced("frame_steps", data=np.arange(5)[::-1]), "frame steps are out of order"),
+    (
+        replaced("rewards", shape=4, dtype="<f8", external=[("/etc/passwd", 0, 32)]),
+        "in a way that mjrec does not write",
+    ),
+    (
+        replaced("rewards", data=np.ones(4), chunks=(4,), compression="lzf"),
+        "rewards is stored in a way",
+    ),
+    (linked_rewards, "no 'rewards' of its"),
+    (replaced("model_changes", data=np.zeros(3)), "is not a group"),
+    (lambda file: file.__delitem__("truncated"), "no 'truncated' of its own"),
+    (lambda file: file.create_group("model_changes/9"), "no '0' of its"),
 ]
 
 

@@ -32,6 +32,7 @@ INVALID = {
         ({"mode": "testing"}, "InvalidArgument", "training"),
         ({"fps": True}, "InvalidArgument", "fps"),
         ({"trajectory_callable": 5}, "InvalidArgument", "trajectory_callable"),
+        ({"policy_file": "none.zip"}, "InvalidArgument", "policy_file"),
         *(
             ({"uid": uid}, "InvalidArgument", "uid")
             for uid in ("", "a/b", ".hidden", "a b", "é", "x" * 101)

@@ -10,7 +10,6 @@ import pytest
 from other_python import run_python
 from recordings import manifest_of
 
-import mjrec
 from mjrec import provenance
 from mjrec.machine import machine_fingerprint
 from mjrec.provenance import Provenance, installed_packages
@@ -63,12 +62,6 @@ def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
     assert Provenance(tmp_path).found(wait=True)["code"]["dirty"] is True
     elsewhere = tmp_path_factory.mktemp("none")
     assert Provenance(elsewhere).found(wait=True)["code"] is None
-
-
-def test_missing_policy_file_is_an_error_at_once(corridor, tmp_path):
-    with pytest.raises(mjrec.InvalidArgument, match="policy_file"):
-        mjrec.Monitor(corridor, tmp_path / "out", policy_file=tmp_path / "none.zip")
-    assert not (tmp_path / "out").exists()
 
 
 def test_short_process_exits_silently():

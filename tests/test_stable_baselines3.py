@@ -96,18 +96,10 @@ def test_monitors_in_a_vector_environment_share_a_directory(kind, tmp_path):
             import mjrec
 
             env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=20)
-            return mjrec.Monitor(
-                env,
-                directory,
-                lambda number: number in (0, 2),
-                resume=True,
-                uid=f"env{index}",
-                width=48,
-                height=32,
-                render="deferred",
-                workers=1,
-                allow_early_reset=True,
-            )
+            options = {"resume": True, "uid": f"env{index}", "workers": 1}
+            options |= {"allow_early_reset": True, "render": "deferred"}
+            options |= {"width": 48, "height": 32}
+            return mjrec.Monitor(env, directory, lambda n: n in (0, 2), **options)
 
         return make_monitored
 

@@ -246,54 +246,6 @@ def test_ctrl_c_leaves_only_the_log(path, monkeypatch):
     finish_trajectory(path)
 
 
-def replaced(name, *data, **options):
-    def replace(file):
-        del file[name]
-        file.create_dataset(name, *data, **options)
-
-    return replace
-
-
-def link_elsewhere(file):
-    del file["rewards"]
-    file["rewards"] = h5py.ExternalLink("other.h5", "/x")
-
-
-DAMAGE = {
-    "not a trajectory": lambda file: file.attrs.update(format=np.bytes_(b"robomimic")),
-    "has the wrong type": lambda file: file.attrs.update(format="mjrec trajectory"),
-    "update mjrec": lambda file: file.attrs.update(format_version=np.int64(2)),
-    "its facts are damaged": lambda file: file.attrs.update(facts=np.bytes_(b"{}")),
-    "the same number of steps": replaced("actions", data=np.zeros((3, 3), "f4")),
-    "components that are not float64": replaced("states", data=np.zeros(41, "f4,f4")),
-    "not a valid dtype": replaced("rewards", data=["a"] * 40),
-    "rewards have": replaced("rewards", data=np.zeros((40, 2))),
-    "the snapshot of a row": replaced("snapshots", data=np.zeros(41)),
-    "frame steps are out of order": replaced("frame_steps", data=np.arange(41)[::-1]),
-    "a way that mjrec does not write": replaced(
-        "rewards", (40,), "<f8", external=[("/etc/passwd", 0, 320)]
-    ),
-    "rewards is stored in a way": replaced(
-        "rewards", data=np.ones(40), chunks=(40,), compression="lzf"
-    ),
-    "no 'rewards' of its": link_elsewhere,
-    "is not a group": replaced("model_changes", data=np.zeros(3)),
-    "no 'truncated' of its own": lambda file: file.__delitem__("truncated"),
-    "no '0' of its": lambda file: file.move("model_changes/0", "model_changes/9"),
-}
-
-
-@pytest.mark.parametrize("reason", DAMAGE)
-def test_file_in_another_layout_is_refused(path, reason):
-    record(path)
-    finish_trajectory(path)
-    with h5py.File(path, "r+") as file:
-        DAMAGE[reason](file)
-    with pytest.raises(UnreadableFile, match=reason) as error:
-        read(path)
-    assert error.value.path == path
-
-
 def record_several(directory, *episodes):
     """Record episodes with as many steps as their number; the last has no end."""
     directory.mkdir(exist_ok=True)
