@@ -15,15 +15,28 @@ from mjrec.formats.locks import Lock
 from mjrec.formats.manifest import StatsFile, read_manifest
 from mjrec.reporting.gathering import gather
 
-VIDEO = "openaigym.video.0.1.video000000"
+VIDEO = "openaigym.video.0.1.video000027"
 MONITOR_FILES = [
     "openaigym.episode_batch.0.1.stats.json",
     "openaigym.episodes.0.1.jsonl",
     "openaigym.manifest.0.1.manifest.json",
+    "openaigym.model.0123456789abcdef.zip",
+    "openaigym.results.0.1.monitor.csv",
+    *(f"openaigym.states.0.1.000000.{end}" for end in ("log", "looks", "tail")),
+    "openaigym.trajectory.0.1.episode000027.h5",
     *(f"{VIDEO}.{end}" for end in ("json", "meta.json", "mp4")),
 ]
-HIDDEN_FILES = [".openaigym.0.1.lock", f".{VIDEO}.mp4.01234567.part"]
-OTHER_FILES = ["openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"]
+HIDDEN_FILES = [
+    *(".openaigym.0.1.lock", ".openaigym.manifest.0.1.lock", f".{VIDEO}.lock"),
+    *(".openaigym.clip.0.1.step000000137.lock", ".openaigym.render.3.lock"),
+    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
+    f".{VIDEO}.mp4.01234567.part",
+]
+OTHER_FILES = [
+    *("openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"),
+    *("openaigym.manifest", "openaigym..manifest.json", "openaigym.states.0.1.log"),
+    *("mjrec.evaluation.0.1.jsonl", "openaigym.video.0.1.video27.mp4"),
+]
 
 
 def touch(directory, *names):
@@ -32,11 +45,16 @@ def touch(directory, *names):
 
 
 def test_detection_takes_exact_names_in_order(tmp_path):
-    """`files` replaces listing the directory."""
+    """Links to files count, folders do not; `files` replaces listing the directory."""
     assert mjrec.detect_monitor_files(str(tmp_path / "missing")) == []
     touch(tmp_path, *MONITOR_FILES, *HIDDEN_FILES, *OTHER_FILES)
-    found = [str(tmp_path / name) for name in MONITOR_FILES]
+    (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
+    links = [f"openaigym.manifest.{n}.1.manifest.json" for n in range(2, 6)]
+    for name, target in zip(links, ["policy.pt", "gone", ".", links[3]], strict=True):
+        (tmp_path / name).symlink_to(target)
+    found = [str(tmp_path / name) for name in sorted([*MONITOR_FILES, links[0]])]
     assert mjrec.detect_monitor_files(tmp_path) == found
+    (tmp_path / links[0]).unlink()
     late, early = (f"openaigym.manifest.{i}.manifest.json" for i in ("1.7", "0.7"))
     others = [f"openaigym.manifest.{i}" for i in ("", "0.8.manifest.json~", "0.9.json")]
     (tmp_path / MONITOR_FILES[2]).unlink()
@@ -49,7 +67,7 @@ def test_detection_takes_exact_names_in_order(tmp_path):
 
 def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
     """Manifest and journal first; links instead of targets; nothing while in use."""
-    touch(tmp_path, *MONITOR_FILES[:-1], HIDDEN_FILES[1], *OTHER_FILES)
+    touch(tmp_path, *MONITOR_FILES[:-1], *HIDDEN_FILES[1:], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
     folder.mkdir()
@@ -66,7 +84,7 @@ def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
     mjrec.clear_monitor_files(str(tmp_path))
     assert {path.name for path in tmp_path.iterdir()} == {*OTHER_FILES, folder.name}
     assert {name.split(".")[1] for name in removed[:2]} == {"manifest", "episodes"}
-    assert len(removed) == 8
+    assert len(removed) == len(MONITOR_FILES) + len(HIDDEN_FILES)
     mjrec.clear_monitor_files(tmp_path / "missing")
 
 
