@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from result_files import entry, write_journal, write_saved
 from trajectories_by_hand import INFIX, write_log
 from trajectory_contents import content_of
 
@@ -66,36 +67,16 @@ def variants(value):
     yield from BAD_VALUES
 
 
-MANIFEST = {
-    "stats": "openaigym.episode_batch.0.7.stats.json",
-    "videos": [["a.mp4", "a.meta.json"], ["b.mp4", "b.meta.json"]],
-    "env_info": {"gym_version": "mjrec-1", "env_id": "A-v0"},
-    "mjrec": {
-        "next_episode_id": 3,
-        "pending": [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}],
-        "broken": ["d.meta.json"],
-    },
-}
-STATS = {
-    "initial_reset_timestamp": 1.5,
-    "timestamps": [2.5, 3.5],
-    "episode_lengths": [3, 4],
-    "episode_rewards": [None, 5.0],
-    "episode_types": ["t", "e"],
-}
-ENTRY = {
-    "episode_id": 0,
-    "length": 3,
-    "reward": 4.0,
-    "type": "t",
-    "seed": 7,
-    "start_time": 1.0,
-    "end_time": 2.0,
-    "options": {"a": [1]},
-    "terminated": True,
-    "truncated": False,
-}
-METADATA = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
+def write_valid(directory):
+    """Write a manifest, statistics, a journal line and metadata."""
+    pending = [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}]
+    details = {"next_episode_id": 3, "pending": pending, "broken": ["d.meta.json"]}
+    videos = [(f"{name}.mp4", f"{name}.meta.json") for name in "ab"]
+    write_saved(directory, "0.7", 0, 1, types="te", videos=videos, details=details)
+    write_journal(directory, "0.7", entry(0, options={"a": [1]}))
+    metadata = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
+    path = directory / "openaigym.video.0.7.video000000.meta.json"
+    path.write_text(json.dumps(metadata))
 
 
 def check_manifest(path):
@@ -117,8 +98,8 @@ def check_statistics(path):
 
 def check_journal(path):
     with contextlib.closing(JournalWriter(path.with_name("again"))) as writer:
-        for entry in read_journal(path):
-            writer.append(entry)
+        for each in read_journal(path):
+            writer.append(each)
 
 
 def check_metadata(path):
@@ -126,17 +107,21 @@ def check_metadata(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "valid", "check"),
+    ("pattern", "check"),
     [
-        ("manifest.0.7.manifest.json", MANIFEST, check_manifest),
-        ("episode_batch.0.7.stats.json", STATS, check_statistics),
-        ("episodes.0.7.jsonl", ENTRY, check_journal),
-        ("video.0.7.video000000.meta.json", METADATA, check_metadata),
+        ("*.manifest.json", check_manifest),
+        ("*.stats.json", check_statistics),
+        ("*.jsonl", check_journal),
+        ("*.meta.json", check_metadata),
     ],
 )
-def test_json_files_with_one_bad_value(tmp_path, name, valid, check):
-    path = tmp_path / f"openaigym.{name}"
-    for value in variants(valid):
+def test_json_files_with_one_bad_value(tmp_path, pattern, check):
+    valid = tmp_path / "valid"
+    valid.mkdir()
+    write_valid(valid)
+    [file] = valid.glob(pattern)
+    path = tmp_path / file.name
+    for value in variants(json.loads(file.read_text())):
         path.write_text(json.dumps(value))
         try:
             check(path)

@@ -300,18 +300,15 @@ class Negative(InvertedPendulumEnv):
 
 
 @pytest.mark.parametrize(
-    ("make_env", "named"),
+    ("kind", "mode", "named"),
     [
-        (
-            lambda: Negative(render_mode="rgb_array", **SIZE),
-            "Negative overrides render()",
-        ),
-        (lambda: InvertedPendulumEnv(render_mode="depth_array", **SIZE), "depth_array"),
+        (Negative, "rgb_array", "Negative overrides render()"),
+        (InvertedPendulumEnv, "depth_array", "depth_array"),
     ],
 )
-def test_overridden_render_is_recorded_live(make_env, named, tmp_path):
+def test_overridden_render_is_recorded_live(kind, mode, named, tmp_path):
     """`render="deferred"` is an error; metadata names the reason."""
-    env = make_env()
+    env = kind(render_mode=mode, **SIZE)
     with pytest.raises(mjrec.PicturesDiffer) as error:
         mjrec.Monitor(env, tmp_path / "out", render="deferred")
     assert named.partition(" ")[0] in str(error.value)

@@ -166,13 +166,9 @@ def test_restored_snapshot_gives_the_same_scene(xml):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("ten_wrapadr", 10**8, "use points up to"),
-        ("ten_wrapadr", -1, "use points up to"),
-        ("ten_wrapadr", 2**31 - 1, "use points up to"),
-        ("ten_wrapnum", 10**8, "use points up to"),
-        ("ten_wrapnum", -5, "use points up to"),
-        ("wrap_obj", 10**8, "but its values range"),
-        ("wrap_obj", -3, "but its values range"),
+        *(("ten_wrapadr", n, "use points up to") for n in (10**8, -1, 2**31 - 1)),
+        *(("ten_wrapnum", n, "use points up to") for n in (10**8, -5)),
+        *(("wrap_obj", n, "but its values range") for n in (10**8, -3)),
         ("ten_wrapadr", np.full(4, np.nan), "ten_wrapadr is .*f8"),
         ("geom_xpos", np.zeros((1, 3)), "belong to another model or version"),
         ("qpos", np.zeros(1), "which is not used for drawing"),
@@ -255,7 +251,7 @@ def test_self_check_notices_a_missing_field(xml, field, words):
         shown.camera.fixedcamid = 0
     row = row_of(model, data)
     if field == "tendon_rgba" and (row[field] == model.tendon_rgba).all():
-        pytest.skip("this MuJoCo does not colour tendons at their limits")
+        pytest.skip("this MuJoCo does not color tendons at their limits")
     row = changed(row, **{field: None})
     before = model.tendon_rgba.copy(), read_state(model, data), data.geom_xpos.copy()
     found = scene_difference(model, data, row, shown)
