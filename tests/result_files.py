@@ -9,7 +9,7 @@ ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 
 def entry(episode_id, **facts):
     """Return an episode whose facts follow from its number."""
-    usual = {
+    defaults = {
         "length": 10 + episode_id,
         "reward": float(episode_id),
         "type": "t",
@@ -20,7 +20,7 @@ def entry(episode_id, **facts):
         "terminated": True,
         "truncated": False,
     }
-    return JournalEntry(episode_id, **{**usual, **facts})
+    return JournalEntry(episode_id, **{**defaults, **facts})
 
 
 def write_journal(directory, infix, *episodes, **options):

@@ -78,9 +78,9 @@ def test_change_of_any_field_is_noticed_by_name(model):
 
 @pytest.mark.parametrize("which", ["camera", "option"])
 def test_change_of_any_view_member_is_noticed_once(model, which):
-    looks, shown = Looks(model), view()
-    looks.follow(shown)
-    struct = getattr(shown, which)
+    looks, watched = Looks(model), view()
+    looks.follow(watched)
+    struct = getattr(watched, which)
     for name in member_names(struct):
         change(struct, name)
         changed = looks.changed() or {}

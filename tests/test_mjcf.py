@@ -39,8 +39,8 @@ FOLLOWER = '<camera name="follow" mode="trackcom" pos="0 -2 0" xyaxes="1 0 0 0 0
 def write(tmp_path):
     def write_model(**values):
         path = tmp_path / "my rail (2).xml"
-        usual = {"timestep": 0.002, "cameras": "", "follower": "", "gear": 5}
-        path.write_text(MODEL.format(**{**usual, **values}))
+        defaults = {"timestep": 0.002, "cameras": "", "follower": "", "gear": 5}
+        path.write_text(MODEL.format(**{**defaults, **values}))
         return path
 
     return write_model

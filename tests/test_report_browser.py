@@ -81,16 +81,16 @@ def open_report(page, folder, report):
 
 
 @pytest.fixture
-def usual(page, videos):
+def benchmark(page, videos):
     open_report(page, videos, benchmark_report())
     return page
 
 
-def test_videos_play(usual):
+def test_videos_play(benchmark):
     """Only one plays at a time."""
-    players = usual.locator("video")
+    players = benchmark.locator("video")
     expect(players).to_have_count(0)
-    buttons = usual.get_by_role("button", name="Play dm_control/")
+    buttons = benchmark.get_by_role("button", name="Play dm_control/")
     expect(buttons).to_have_count(4)
     for i, start in enumerate(("click", "Enter", "Space", "click")):
         button = buttons.first
@@ -98,13 +98,13 @@ def test_videos_play(usual):
         player = players.nth(i)
         expect(player).to_be_focused()
         expect(player).to_have_accessible_name(re.compile(r"^dm_control/\S+, seed"))
-        usual.wait_for_function(
+        benchmark.wait_for_function(
             "i => document.querySelectorAll('video')[i].currentTime > 0.1", arg=i
         )
         facts = player.evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
         assert facts == [64, 48, pytest.approx(FRAMES / FPS, abs=1 / FPS)]
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
-    assert usual.evaluate(playing) <= 1
+    assert benchmark.evaluate(playing) <= 1
 
 
 @parametrize("single_file", [False, True])
@@ -145,37 +145,37 @@ def test_tables_sort_by_mouse_and_keyboard(page, tmp_path):
 
 
 @pytest.mark.thorough
-def test_gallery_filters_by_mouse_and_keyboard(usual):
+def test_gallery_filters_by_mouse_and_keyboard(benchmark):
     """A link in the episode table shows a hidden video again."""
 
     def shown():
-        cards = usual.locator(".card:not([hidden])").all()
+        cards = benchmark.locator(".card:not([hidden])").all()
         return [card.get_attribute("id") for card in cards]
 
-    usual.get_by_role("radio", name="Worst").click()
+    benchmark.get_by_role("radio", name="Worst").click()
     assert shown() == ["video-1", "video-3"]
-    expect(usual.locator("#gallery-count")).to_have_text("2 of 4 videos")
-    usual.locator("#gallery-task").select_option(label="dm_control/cheetah-run")
+    expect(benchmark.locator("#gallery-count")).to_have_text("2 of 4 videos")
+    benchmark.locator("#gallery-task").select_option(label="dm_control/cheetah-run")
     assert shown() == ["video-3"]
-    usual.get_by_role("radio", name="Worst").press("ArrowLeft")
-    expect(usual.get_by_role("radio", name="Best")).to_be_checked()
+    benchmark.get_by_role("radio", name="Worst").press("ArrowLeft")
+    expect(benchmark.get_by_role("radio", name="Best")).to_be_checked()
     assert shown() == ["video-2"]
-    usual.locator("#episodes-table").get_by_role("button", name="Return").click()
-    usual.locator("#episodes-table tbody a").first.click()
-    expect(usual.locator("#video-0")).to_be_in_viewport()
-    assert usual.url.endswith("#video-0")
+    benchmark.locator("#episodes-table").get_by_role("button", name="Return").click()
+    benchmark.locator("#episodes-table tbody a").first.click()
+    expect(benchmark.locator("#video-0")).to_be_in_viewport()
+    assert benchmark.url.endswith("#video-0")
 
 
 @pytest.mark.thorough
-def test_command_is_copied_or_selected(usual):
+def test_command_is_copied_or_selected(benchmark):
     """A browser may refuse the clipboard to local files."""
-    card = usual.locator("#video-0")
+    card = benchmark.locator("#video-0")
     card.get_by_text("File, hash and command").click()
     command = card.get_by_role("button", name="Copy the command")
     sha256 = card.get_by_role("button", name="Copy the hash")
     command.click()
     expect(command).to_have_text("Copied")
-    usual.evaluate(
+    benchmark.evaluate(
         """() => {
             navigator.clipboard.writeText = () => Promise.reject(new Error("no"));
             document.execCommand = () => false;
@@ -183,7 +183,7 @@ def test_command_is_copied_or_selected(usual):
     )
     sha256.click()
     expect(sha256).to_have_text("Selected")
-    assert usual.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
+    assert benchmark.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
 
 
 @pytest.mark.thorough

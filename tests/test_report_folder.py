@@ -128,8 +128,19 @@ def test_hostile_env_id_is_text_and_no_file_name(tmp_path):
 
 
 def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
+    """A report that fails leaves the older one."""
     (tmp_path / "report").mkdir()
-    write_report(recordings, tmp_path / "report")
+    page = write_report(recordings, tmp_path / "report")
+    before = page.read_text()
+
+    def stop(progress):
+        if progress == ReportProgress("videos", 2, 2):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_report(recordings, tmp_path / "report", title="2", on_progress=stop)
+    assert page.read_text() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
     run = tmp_path / "run"
     run.mkdir()
     # A directory with only a damaged file still has a report.
@@ -165,20 +176,6 @@ def test_other_files_are_not_replaced(
         write_report(recordings, tmp_path / target, **options)
     assert names(tmp_path) == before
     assert (tmp_path / mine).read_text() == "mine"
-
-
-def test_failed_report_leaves_the_older_one(recordings, tmp_path):
-    page = write_report(recordings, tmp_path / "report")
-    before = page.read_text()
-
-    def stop(progress):
-        if progress == ReportProgress("videos", 2, 2):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_report(recordings, tmp_path / "report", title="2", on_progress=stop)
-    assert page.read_text() == before
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
 
 
 IMAGE = "<img[^>]* src=.data:image/jpeg;base64,"

@@ -99,9 +99,9 @@ def test_video_card_shows_episode_size_command_and_rule():
 
 
 def test_notes_explain_missing_and_different_figures():
-    usual = [("GL", "llvmpipe"), ("Policy", "p")]
+    shared = [("GL", "llvmpipe"), ("Policy", "p")]
     first, second, odd, large = (
-        task(name, returns, provenance=[*usual, ("Seeds", name)])
+        task(name, returns, provenance=[*shared, ("Seeds", name)])
         for name, returns in (
             ("a", [1.0, 2.0, 4.5]),
             *(("b", [1.0, 2.0, 3.0]), ("odd", [1.0]), ("large", [7.0, 8.0])),
@@ -140,16 +140,16 @@ def test_page_of_many_episodes_holds_a_selection():
         for i in range(600)
     ]
     page = page_of(contents(large, across={}))
-    (shown,) = data_of(page)["tasks"]
-    assert len(shown["run"]) < 20_000
-    rewards = dict(zip(shown["episode"], shown["total_reward"], strict=True))
+    (listed,) = data_of(page)["tasks"]
+    assert len(listed["run"]) < 20_000
+    rewards = dict(zip(listed["episode"], listed["total_reward"], strict=True))
     assert (rewards[0], rewards[2], rewards[17_000]) == (-1e307, 1e307, None)
     assert "evaluation/results.csv" in page
     assert "30\u202f000" in page
     # The table links to the files of other videos.
     assert len(Elements(page).players()) == 300
     places = [
-        shown["videos"][str(shown["episode"].index(15_000 + i))] for i in (599, 598)
+        listed["videos"][str(listed["episode"].index(15_000 + i))] for i in (599, 598)
     ]
     assert places == [["#video-599"], ["./598.mp4"]]
 

@@ -135,10 +135,10 @@ def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
         camera = {"camera_name": name} if name else {"camera_id": number}
         live = record(make(env_id, **camera), tmp_path / str(number))
         check_frames(tmp_path / str(number), live, workers[:1])
-        asked = make(env_id, render_mode=None, height=9, width=9)
+        bare = make(env_id, render_mode=None, height=9, width=9)
         view = {"camera": name or number, **SIZE}
-        record(asked, tmp_path / f"{number} asked", list, **view)
-        check_frames(tmp_path / f"{number} asked", live, workers[:1])
+        record(bare, tmp_path / f"{number} bare", list, **view)
+        check_frames(tmp_path / f"{number} bare", live, workers[:1])
 
 
 def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
