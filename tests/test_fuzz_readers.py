@@ -134,21 +134,6 @@ def check_refusal(error, path):
     assert len(str(error)) < 2000 + len(str(path))
 
 
-VALUES = st.recursive(
-    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
-    lambda inner: st.one_of(
-        st.lists(inner, max_size=3), st.dictionaries(st.text(), inner, max_size=3)
-    ),
-    max_leaves=6,
-)
-
-
-@FEW
-@given(value=VALUES)
-def test_json_text_keeps_any_value(value):
-    assert dumps(loads(dumps(value))) == dumps(value)
-
-
 @pytest.mark.parametrize(
     "value",
     [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
