@@ -13,21 +13,34 @@ from mjrec.results.monitor_files import MonitorFiles
 VIDEO = "openaigym.video.0.1.video000027"
 
 
+OF_EPISODE = [
+    *(f"{VIDEO}.mp4", f"{VIDEO}.meta.json", f".{VIDEO}.mp4.0123abcd.part"),
+    *(f".{VIDEO}.lock", "openaigym.trajectory.0.1.episode000027.h5"),
+]
+OF_MONITOR = [
+    *("openaigym.episodes.0.1.jsonl", "openaigym.manifest.0.1.manifest.json"),
+    *("openaigym.episode_batch.0.1.stats.json", "openaigym.results.0.1.monitor.csv"),
+    *(f"openaigym.states.0.1.000000.{end}" for end in ("log", "tail", "looks")),
+    *(".openaigym.0.1.lock", ".openaigym.manifest.0.1.lock"),
+    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
+    ".openaigym.clip.0.1.step000000137.lock",
+    "openaigym.clip.0.1.step000000137.part000000",  # exists only inside logs
+]
+OTHERS = [
+    *("openaigym.model.0123456789abcdef.zip", ".openaigym.render.3.lock", "notes"),
+    *("openaigym.notes.txt", "openaigym.manifest", "openaigym..manifest.json"),
+    *("mjrec.evaluation.0.1.jsonl", "openaigym.video.0.1.video27.mp4"),
+    "openaigym.states.0.1.log",
+]
+
+
 @pytest.mark.parametrize(
     ("names", "parts"),
-    [
-        ((f"{VIDEO}.mp4", f"{VIDEO}.meta.json", f".{VIDEO}.lock"), ("0.1", 27)),
-        ([f".{VIDEO}.mp4.0123abcd.part"], ("0.1", 27)),
-        (["openaigym.trajectory.0.1.episode000027.h5"], ("0.1", 27)),
-        (("openaigym.states.0.1.000000.log", ".openaigym.0.1.lock"), ("0.1", None)),
-        # Exists only inside logs.
-        (["openaigym.clip.0.1.step000000137.part000000"], ("0.1", None)),
-        (("openaigym.model.0123456789abcdef.zip", "openaigym.notes"), (None, None)),
-    ],
+    [(OF_EPISODE, ("0.1", 27)), (OF_MONITOR, ("0.1", None)), (OTHERS, (None, None))],
 )
 def test_names_give_monitor_and_episode(names, parts):
     for name in names:
-        assert (infix_of(name), episode_of(name)) == parts
+        assert (infix_of(name), episode_of(name)) == parts, name
 
 
 FIRST = "openaigym.video.0.7.video000027.mp4"
