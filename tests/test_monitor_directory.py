@@ -10,39 +10,6 @@ from mjrec.formats import monitor_directory
 from mjrec.formats.monitor_directory import camera_part, episode_of, infix_of, with_part
 from mjrec.results.monitor_files import MonitorFiles
 
-VIDEO = "openaigym.video.0.1.video000027"
-
-
-OF_EPISODE = [
-    *(f"{VIDEO}.mp4", f"{VIDEO}.meta.json", f".{VIDEO}.mp4.0123abcd.part"),
-    *(f".{VIDEO}.lock", "openaigym.trajectory.0.1.episode000027.h5"),
-]
-OF_MONITOR = [
-    *("openaigym.episodes.0.1.jsonl", "openaigym.manifest.0.1.manifest.json"),
-    *("openaigym.episode_batch.0.1.stats.json", "openaigym.results.0.1.monitor.csv"),
-    *(f"openaigym.states.0.1.000000.{end}" for end in ("log", "tail", "looks")),
-    *(".openaigym.0.1.lock", ".openaigym.manifest.0.1.lock"),
-    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
-    ".openaigym.clip.0.1.step000000137.lock",
-    "openaigym.clip.0.1.step000000137.part000000",  # exists only inside logs
-]
-OTHERS = [
-    *("openaigym.model.0123456789abcdef.zip", ".openaigym.render.3.lock", "notes"),
-    *("openaigym.notes.txt", "openaigym.manifest", "openaigym..manifest.json"),
-    *("mjrec.evaluation.0.1.jsonl", "openaigym.video.0.1.video27.mp4"),
-    "openaigym.states.0.1.log",
-]
-
-
-@pytest.mark.parametrize(
-    ("names", "parts"),
-    [(OF_EPISODE, ("0.1", 27)), (OF_MONITOR, ("0.1", None)), (OTHERS, (None, None))],
-)
-def test_names_give_monitor_and_episode(names, parts):
-    for name in names:
-        assert (infix_of(name), episode_of(name)) == parts, name
-
-
 FIRST = "openaigym.video.0.7.video000027.mp4"
 CAMERAS = (
     *("side", "top-left_2", "a b", "über", "../up", "/etc", "a.b~c", "", "%41", "\n"),

@@ -13,6 +13,7 @@ import mjrec
 from mjrec.errors import DirectoryInUse, UnreadableFile
 from mjrec.formats.locks import Lock
 from mjrec.formats.manifest import StatsFile, read_manifest
+from mjrec.formats.monitor_directory import episode_of, infix_of
 from mjrec.reporting.gathering import gather
 
 VIDEO = "openaigym.video.0.1.video000027"
@@ -42,6 +43,15 @@ OTHER_FILES = [
 def touch(directory, *names):
     for name in names:
         (directory / name).touch()
+
+
+def test_names_give_monitor_and_episode():
+    for name in MONITOR_FILES + HIDDEN_FILES + OTHER_FILES:
+        is_shared = ".model." in name or ".render." in name or name in OTHER_FILES
+        assert infix_of(name) == (None if is_shared else "0.1"), name
+        assert episode_of(name) == (27 if "000027" in name else None), name
+    # Exists only inside logs.
+    assert infix_of("openaigym.clip.0.1.step000000137.part000000") == "0.1"
 
 
 def test_detection_takes_exact_names_in_order(tmp_path):
