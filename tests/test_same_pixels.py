@@ -6,6 +6,7 @@ import copy
 import gc
 import importlib.util
 import json
+from pathlib import Path
 
 import gymnasium
 import mujoco
@@ -231,64 +232,30 @@ def test_composer(name, camera, workers, tmp_path):
     check_frames(tmp_path, live, workers[:1])
 
 
-ENDLESS = """
-<mujoco>
-  <visual><quality shadowsize="256" offsamples="0"/><map zfar="50"/></visual>
-  <asset>
-    <texture name="checks" type="2d" builtin="checker" rgb1=".2 .6 .3" rgb2=".8 .8 .7"
-      width="32" height="32"/>
-    <material name="checks" texture="checks" texrepeat="1.7 1.7" reflectance=".2"/>
-  </asset>
-  <worldbody>
-    <light directional="true" dir="0 .3 -1"/>
-    <geom type="plane" size="0 0 1" material="checks"/>
-    <body pos="0 0 .5">
-      <joint name="rail" type="slide" axis="1 .3 0"/>
-      <geom size=".3" rgba="1 .2 .1 1" mass="1"/>
-      <camera name="ride" mode="trackcom" pos="0 -3 1.5" xyaxes="1 0 0 0 .4 .9"/>
-      <site name="hook" pos="0 0 1"/>
-      <body pos="0 0 .4">
-        <joint axis="0 1 0"/>
-        <geom type="capsule" size=".05" fromto="0 0 0 .6 0 0"/>
-        <site name="end" pos=".6 0 0"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <spatial limited="true" range="0 .9" width=".03">
-      <site site="hook"/><site site="end"/>
-    </spatial>
-  </tendon>
-  <actuator>
-    <motor joint="rail" gear="400000" ctrllimited="true" ctrlrange="-1 1"/>
-  </actuator>
-</mujoco>
-"""
-
-
-@pytest.fixture
-def endless(tmp_path):
-    path = tmp_path / "endless.xml"
-    path.write_text(ENDLESS)
+def own_environment(name):
     options = EnvironmentOptions(**SIZE, max_steps=STEPS)
-    return environment_from_name(str(path), options).environment
+    path = Path(__file__).parents[1] / "assets" / f"{name}.xml"
+    env = environment_from_name(str(path), options).environment
+    draw_quickly(env.unwrapped.simulation.model)
+    return env
 
 
-def test_own_model_over_an_infinite_plane(endless, workers, tmp_path):
-    """The plane is drawn around the previous frame's camera; a tendon is taut."""
-    check_frames(tmp_path / "out", record(endless, tmp_path / "out"), workers)
+@pytest.mark.parametrize("name", ["walker_on_plane", "showcase"])
+def test_own_model(name, workers, tmp_path):
+    """An infinite plane is drawn around the previous frame's camera."""
+    check_frames(tmp_path, record(own_environment(name), tmp_path), workers)
 
 
-def test_forget_frames_resets_cameras(endless, tmp_path):
-    directory, previous = tmp_path / "out", []
-    with monitored(endless, directory) as monitor:
+def test_forget_frames_resets_cameras(tmp_path):
+    previous = []
+    with monitored(own_environment("walker_on_plane"), tmp_path) as monitor:
         for number in range(3):
             if number == 2:
                 monitor.forget_frames()
             monitor.reset(seed=0)
             monitor.step(np.zeros(1))
         monitor.close(wait=False)
-    for path in in_flight(directory):
+    for path in in_flight(tmp_path):
         with open_trajectory(path) as reader:
             previous.append(reader.facts["scene"]["previous_cameras"])
     assert [each is None for each in previous] == [True, False, True]
