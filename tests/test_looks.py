@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes to a model or view are noticed, and only changes."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,29 +17,11 @@ from mjrec.simulation.fields import (
 from mjrec.simulation.looks import Looks
 from mjrec.simulation.view import SceneView
 
-# With a texture, a mesh and a height field.
-RICH = """
-<mujoco>
-  <asset>
-    <texture name="t" type="2d" builtin="checker" width="64" height="64"/>
-    <material name="a" texture="t"/>
-    <hfield name="h" nrow="40" ncol="40" size="1 1 1 1"/>
-    <mesh name="m" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>
-  </asset>
-  <worldbody>
-    <light/>
-    <geom type="plane" size="1 1 1" material="a"/>
-    <geom type="hfield" hfield="h"/>
-    <camera name="c"/>
-    <body name="b"><freejoint/><geom size=".1"/><site name="s"/></body>
-  </worldbody>
-</mujoco>
-"""
-
 
 @pytest.fixture
 def model():
-    return mujoco.MjModel.from_xml_string(RICH)
+    path = Path(__file__).parents[1] / "assets/showcase.xml"
+    return mujoco.MjModel.from_xml_path(str(path))
 
 
 def view():
