@@ -35,13 +35,10 @@ class Inspector:
     """A process that reads files on request."""
 
     def __enter__(self):
-        self._process = subprocess.Popen(
-            [sys.executable, __file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            text=True,
-        )
+        environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        command = [sys.executable, __file__]
+        self._process = subprocess.Popen(command, env=environ, **pipes)
         return self
 
     def __exit__(self, *_):

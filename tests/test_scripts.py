@@ -27,14 +27,9 @@ def checkout(tmp_path):
 
 def bash(checkout, command, **environment):
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MJREC_")}
-    return subprocess.run(
-        ["bash", "-c", command],
-        cwd=checkout,
-        env={**kept, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    options = {"cwd": checkout, "env": {**kept, **environment}, "timeout": 60}
+    command = ["bash", "-c", command]
+    return subprocess.run(command, capture_output=True, text=True, **options)
 
 
 def succeeds(checkout, condition):
