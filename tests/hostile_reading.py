@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files that may crash, hang or eat up whoever reads them.
+"""Read hostile files in forked processes.
 
-`Inspector` starts one process, which forks for every file: what a reader does to its
-process, whatever that is, is an outcome. The forks have a gigabyte of memory.
+`Inspector` starts one process that forks for each file, with a gigabyte of memory.
+A fork that crashes, hangs or runs out of memory is an outcome.
 """
 
 import io
@@ -28,31 +28,27 @@ from mjrec.simulation.mjcf import load_mjcf
 from mjrec.simulation.model_store import load_model
 
 MEMORY = 1 << 30
-# A machine may be busy with other things.
-SECONDS = 120
+SECONDS = 120  # long enough for a busy machine
 
 
 class Inspector:
-    """A process that reads files when it is told to."""
+    """A process that reads files on request."""
 
     def __enter__(self):
-        self._process = subprocess.Popen(
-            [sys.executable, __file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            text=True,
-        )
+        environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        command = [sys.executable, __file__]
+        self._process = subprocess.Popen(command, env=environ, **pipes)
         return self
 
     def __exit__(self, *_):
         self._process.communicate()
 
     def read(self, reader, path):
-        """Return what comes of reading `path` with one of `READERS`.
+        """Return the outcome of reading `path` with one of `READERS`.
 
-        Its kind is `value`, `refused` (an error of ours), `failed` (another one) or
-        `died`. It has what was said, the path that the error names, and the seconds.
+        Its `kind` is `value`, `refused` (an error of mjrec), `failed` (another error)
+        or `died`; it has the error, the path that the error names, and the seconds.
         """
         self._process.stdin.write(f"{json.dumps([reader, str(path)])}\n")
         self._process.stdin.flush()
@@ -62,17 +58,17 @@ class Inspector:
         return outcome
 
     def reads(self, reader, path):
-        """Check that `path` is read, soon."""
+        """Check that `path` is read soon."""
         outcome = self.read(reader, path)
         assert outcome.kind == "value", outcome
 
     def refuses(self, reader, path):
-        """Check that reading `path` is one error of ours, soon; return its reason."""
+        """Check that reading `path` gives one short error soon, and return it."""
         outcome = self.read(reader, path)
         assert outcome.kind == "refused", outcome
-        assert outcome.names == str(path), outcome
-        assert len(outcome.said) < 2000 + len(str(path)), outcome.said[:4000]
-        return outcome.said
+        assert outcome.path == str(path), outcome
+        assert len(outcome.error) < 2000 + len(str(path)), outcome.error[:4000]
+        return outcome.error
 
 
 def _trajectory(path):
@@ -85,7 +81,6 @@ def _trajectory(path):
 
 
 def _finish(path):
-    """Finish the episode that this is a file of."""
     try:
         finish_trajectory(path.with_name("openaigym.trajectory.0.7.episode000000.h5"))
     except UnreadableFile as error:
@@ -104,7 +99,6 @@ def _metadata(path):
 
 
 def _model(path):
-    """Read the model of these files that `facts.json` beside them is about."""
     load_model(path.parent, json.loads((path.parent / "facts.json").read_text()))
 
 
@@ -132,11 +126,11 @@ def _outcome(reader, path):
     try:
         READERS[reader](path)
     except Error as error:
-        names = getattr(error, "path", None)
-        return {"kind": "refused", "said": str(error), "names": names and str(names)}
+        named = getattr(error, "path", None)
+        return {"kind": "refused", "error": str(error), "path": named and str(named)}
     except BaseException:
-        return {"kind": "failed", "said": traceback.format_exc()[-3000:], "names": None}
-    return {"kind": "value", "said": "", "names": None}
+        return {"kind": "failed", "error": traceback.format_exc()[-3000:], "path": None}
+    return {"kind": "value", "error": "", "path": None}
 
 
 def _forked(reader, path):
@@ -153,10 +147,10 @@ def _forked(reader, path):
         os.write(outgoing, json.dumps(_outcome(reader, path)).encode())
         os._exit(0)
     os.close(outgoing)
-    with os.fdopen(incoming, "rb") as said:
-        text = said.read()
+    with os.fdopen(incoming, "rb") as pipe:
+        text = pipe.read()
     _, status = os.waitpid(child, 0)
-    died = {"kind": "died", "said": f"status {status}", "names": None}
+    died = {"kind": "died", "error": f"status {status}", "path": None}
     outcome = json.loads(text) if text else died
     return {**outcome, "seconds": time.monotonic() - beginning}
 

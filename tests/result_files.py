@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What monitors leave of their episodes, written by hand."""
+"""Monitor files of results, written by hand."""
 
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
@@ -8,8 +8,8 @@ ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 
 
 def entry(episode_id, **facts):
-    """Return an episode that tells its number in all that is known of it."""
-    usual = {
+    """Return an episode whose facts follow from its number."""
+    defaults = {
         "length": 10 + episode_id,
         "reward": float(episode_id),
         "type": "t",
@@ -20,11 +20,11 @@ def entry(episode_id, **facts):
         "terminated": True,
         "truncated": False,
     }
-    return JournalEntry(episode_id, **{**usual, **facts})
+    return JournalEntry(episode_id, **{**defaults, **facts})
 
 
 def write_journal(directory, infix, *episodes, **options):
-    """Write the journal of episodes, or of those of these numbers."""
+    """Write a journal of entries or episode numbers."""
     path = directory / f"openaigym.episodes.{infix}.jsonl"
     writer = JournalWriter(path, **options)
     for each in episodes:
@@ -34,7 +34,7 @@ def write_journal(directory, infix, *episodes, **options):
 
 
 def stats_of(*episodes, start=98.0, types=""):
-    """Return the statistics of the episodes of these numbers, all of type "t"."""
+    """Return the statistics of episode numbers."""
     entries = [entry(number) for number in episodes]
     return StatsFile(
         initial_reset_timestamp=start,
@@ -46,7 +46,7 @@ def stats_of(*episodes, start=98.0, types=""):
 
 
 def write_saved(directory, infix, *episodes, stats=None, **options):
-    """Write statistics, and the manifest that names them, with options of both."""
+    """Write a statistics file and its manifest."""
     env_info, details = options.pop("env_info", ENV_INFO), options.pop("details", None)
     videos = tuple(options.pop("videos", ()))
     name = f"openaigym.episode_batch.{infix}.stats.json"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded episode that is small and has what makes frames hard to draw again.
+"""A small recorded episode that is hard to draw again.
 
-A camera rides over an infinite plane, which is drawn around the camera of the frame
-before; on the way the terrain, a texture and a colour change.
+The camera rides over an infinite plane, which is drawn around the previous frame's
+camera, while terrain, a texture and a color change.
 """
 
 from pathlib import Path
@@ -47,26 +47,23 @@ PLAIN = """
 
 
 class Ride(NamedTuple):
-    """A recorded episode, and the frames that were seen of it."""
-
     path: Path
     frames: list
 
 
 def start(xml=PLAIN):
-    """Return the model at its start."""
     model = mujoco.MjModel.from_xml_string(xml)
     return model, mujoco.MjData(model)
 
 
 def move(model, data, number):
-    """Go on to a frame's place, unevenly."""
+    """Move to a frame's position, in uneven steps."""
     data.qpos[0] = 3.1 * number + 2 * (number % 3)
     mujoco.mj_forward(model, data)
 
 
 def change(model, number):
-    """Change the model before a frame; return the names of what has changed."""
+    """Change the model before a frame; return the changed fields."""
     if number == 3:
         model.hfield_data[20:40] = 1
         return ["hfield_data"]
@@ -80,7 +77,7 @@ def change(model, number):
 
 
 def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
-    """Record a ride as a log, with the frames that a viewer had shown."""
+    """Record a ride as a log; return it with its frames."""
     model, data = start()
     option = mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
@@ -89,7 +86,7 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     view = SceneView(camera=shown, option=option, label="rider", **size)
     kind = snapshot_dtype(model, data, option)
     store = ModelStore(directory)
-    known = {
+    facts = {
         "episode_id": 0,
         "infix": "0.1",
         "model": store.add(model),
@@ -103,14 +100,14 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     source = SnapshotSource(model, data, kind)
     logs = new_logs(directory, "0.1")
     name = "openaigym.trajectory.0.1.episode000000"
-    span = logs.begin(name, known, row_dtype(snapshot=kind))
+    span = logs.begin(name, facts, row_dtype(snapshot=kind))
     snapshot = np.empty(kind.itemsize // 8, np.uint64)
-    seen = []
+    frames = []
     with SceneRenderer(model, camera=shown, scene_option=option, **size) as renderer:
         for number in range(count):
             names = change(model, number)
             move(model, data, number)
-            # Frames are of every second step.
+            # Each frame shows two steps.
             for step in sorted({max(2 * number - 1, 0), 2 * number}):
                 add_row(span, step)
             if names:
@@ -119,6 +116,6 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
             source.take(snapshot)
             add_row(span, 2 * number, snapshot=snapshot, is_step=False)
             renderer.model_changed()
-            seen.append(renderer.render(data))
+            frames.append(renderer.render(data))
     logs.close()
-    return Ride(logs.path_of(name), seen)
+    return Ride(logs.path_of(name), frames)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium-Robotics' environments, as far as they run with the mujoco installed."""
+"""Gymnasium-Robotics environments that run with the installed mujoco."""
 
 import contextlib
 import importlib.util
@@ -14,7 +14,7 @@ has_robotics = importlib.util.find_spec("gymnasium_robotics") is not None
 
 
 def robotics_ids():
-    """Return the ids of all that need no mujoco_py; none without the package."""
+    """Return the ids without mujoco_py; none without the package."""
     if not has_robotics:
         return []
     _register()
@@ -24,33 +24,29 @@ def robotics_ids():
         if str(spec.entry_point).startswith("gymnasium_robotics")
         and "MujocoPy" not in str(spec.entry_point)
         and ".envs.mujoco." not in str(spec.entry_point)
-        # Only their rewards differ.
+        # Only rewards differ.
         and "Dense" not in env_id
     )
 
 
 @contextlib.contextmanager
 def robots_that_reset():
-    """Let Gymnasium-Robotics compare MuJoCo's enumerations with NumPy's integers.
+    """Patch Gymnasium-Robotics so that Fetch, the hand and the kitchen can reset.
 
-    From mujoco 3.12 on `mjtJoint.mjJNT_FREE == np.int32(0)` is False, and resets of
-    Fetch, the hand and the kitchen end at an assertion. Does nothing without the
-    package.
+    Since mujoco 3.12 `mjtJoint.mjJNT_FREE == np.int32(0)` is False.
     """
     if not has_robotics:
         yield
         return
     _register()
     joints = {f"mjJNT_{n}": i for i, n in enumerate(("FREE", "BALL", "SLIDE", "HINGE"))}
-    ints = {**vars(mujoco), "mjtJoint": types.SimpleNamespace(**joints)}
+    patched = {**vars(mujoco), "mjtJoint": types.SimpleNamespace(**joints)}
+    where = "gymnasium_robotics.utils.mujoco_utils.mujoco"
     with (
-        mock.patch(
-            "gymnasium_robotics.utils.mujoco_utils.mujoco",
-            types.SimpleNamespace(**ints),
-        ),
+        mock.patch(where, types.SimpleNamespace(**patched)),
         warnings.catch_warnings(),
     ):
-        # They warn of other versions of themselves, and of their own observations.
+        # They warn about other versions and their own observations.
         warnings.simplefilter("ignore")
         yield
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sound file of every kind that is read back, to be spoilt."""
+"""One valid file of each kind that mjrec reads, for tests to damage."""
 
 import json
 
@@ -42,7 +42,7 @@ def finished(directory):
     return finish_trajectory(write_log(directory))
 
 
-def stored(directory, xml=SPHERE):
+def store_model(directory, xml=SPHERE):
     source = directory.parent / "main.xml"
     source.write_text(xml)
     store = ModelStore(directory)
@@ -54,13 +54,13 @@ def stored(directory, xml=SPHERE):
 
 
 def compiled(directory):
-    facts = {**stored(directory), "xml": None}
+    facts = {**store_model(directory), "xml": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["mjb"]
 
 
 def source(directory):
-    facts = {**stored(directory), "mujoco": "3.1.4", "mjb": None}
+    facts = {**store_model(directory), "mujoco": "3.1.4", "mjb": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["xml"]
 
@@ -79,7 +79,7 @@ def video(directory):
 
 
 def killed(directory):
-    """Record an episode and be killed; return its log."""
+    """Record an episode without an end; return its log."""
     dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
     logs = new_logs(directory, tail_bytes=1)
     span = logs.begin(trajectory_prefix(INFIX, 0), {}, dtype)
@@ -101,7 +101,7 @@ def killed_with(part):
     return lambda directory: killed(directory).with_suffix(part)
 
 
-# Each with the reader of `hostile_reading` that it is for.
+# The reader of `hostile_reading` and the builder of each kind.
 FILES = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),

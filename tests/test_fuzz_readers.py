@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever a file holds, reading it gives what it says or one error that names it.
+"""Readers of damaged files return valid content or one error that names the file.
 
-Hypothesis makes the files: sound ones, changed where their structure has joints, with
-checksums that are right again. It always makes the same ones.
+Hypothesis derives the damage, the same in each run.
 """
 
 import contextlib
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from result_files import entry, write_journal, write_saved
 from trajectories_by_hand import INFIX, write_log
 from trajectory_contents import content_of
 
@@ -46,106 +46,85 @@ FEW = settings(
 )
 
 
-# --- JSON ----------------------------------------------------------------------------
-
-# What has broken readers: each is tried in every place.
-NASTY = [
+# Values that have broken readers: each is tried in every place.
+BAD_VALUES = [
     *(None, True, 0, 5, -1, 0.5, 10**400, 2**64, -(2**63), 1e308, float("inf")),
     *("", "5", "..", "../x", "a/b", "\ud800", "a" * 300, "1e999999999"),
     *([], {}, [5], [None], ["../x"], [[]], {"a": 1}, [{}], [{"video": 5}]),
 ]
 
 
-def spoilt(sound):
-    """Yield `sound` with each thing in it replaced by each nasty one, and left out."""
-    if isinstance(sound, dict | list):
-        for key in [*sound] if isinstance(sound, dict) else range(len(sound)):
-            changed = copy.copy(sound)
-            for inner in spoilt(sound[key]):
+def variants(value):
+    """Yield `value` with each part removed, and replaced by each bad value."""
+    if isinstance(value, dict | list):
+        for key in [*value] if isinstance(value, dict) else range(len(value)):
+            changed = copy.copy(value)
+            for inner in variants(value[key]):
                 changed[key] = inner
                 yield copy.copy(changed)
             del changed[key]
             yield changed
-    yield from NASTY
+    yield from BAD_VALUES
 
 
-MANIFEST = {
-    "stats": "openaigym.episode_batch.0.7.stats.json",
-    "videos": [["a.mp4", "a.meta.json"], ["b.mp4", "b.meta.json"]],
-    "env_info": {"gym_version": "mjrec-1", "env_id": "A-v0"},
-    "mjrec": {
-        "next_episode_id": 3,
-        "pending": [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}],
-        "broken": ["d.meta.json"],
-    },
-}
-STATS = {
-    "initial_reset_timestamp": 1.5,
-    "timestamps": [2.5, 3.5],
-    "episode_lengths": [3, 4],
-    "episode_rewards": [None, 5.0],
-    "episode_types": ["t", "e"],
-}
-ENTRY = {
-    "episode_id": 0,
-    "length": 3,
-    "reward": 4.0,
-    "type": "t",
-    "seed": 7,
-    "start_time": 1.0,
-    "end_time": 2.0,
-    "options": {"a": [1]},
-    "terminated": True,
-    "truncated": False,
-}
-METADATA = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
+def write_valid(directory):
+    """Write a manifest, statistics, a journal line and metadata."""
+    pending = [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}]
+    details = {"next_episode_id": 3, "pending": pending, "broken": ["d.meta.json"]}
+    videos = [(f"{name}.mp4", f"{name}.meta.json") for name in "ab"]
+    write_saved(directory, "0.7", 0, 1, types="te", videos=videos, details=details)
+    write_journal(directory, "0.7", entry(0, options={"a": [1]}))
+    metadata = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
+    path = directory / "openaigym.video.0.7.video000000.meta.json"
+    path.write_text(json.dumps(metadata))
 
 
-def manifest(path):
-    """What is read can be written again, and names files of the directory only."""
-    found = read_manifest(path)
-    names = [found.stats, *(name for pair in found.videos for name in pair)]
+def check_manifest(path):
+    """Check that a manifest can be written again and names local files only."""
+    manifest = read_manifest(path)
+    names = [manifest.stats, *(name for pair in manifest.videos for name in pair)]
     assert all((path.parent / name).parent == path.parent for name in names)
     assert all(len(os.fsencode(name)) <= 255 for name in names)
-    write_manifest(path, found)
-    # It uses more of it than reading checks.
+    write_manifest(path, manifest)
+    # An update uses more of it than reading checks.
     update_manifests(path.parent)
 
 
-def statistics(path):
-    found = read_stats_file(path)
-    write_stats_file(path, found)
-    assert read_stats_file(path).episode_lengths == found.episode_lengths
+def check_statistics(path):
+    stats = read_stats_file(path)
+    write_stats_file(path, stats)
+    assert read_stats_file(path).episode_lengths == stats.episode_lengths
 
 
-def journal(path):
-    """The lines that cannot be written again are left out."""
+def check_journal(path):
     with contextlib.closing(JournalWriter(path.with_name("again"))) as writer:
-        for entry in read_journal(path):
-            writer.append(entry)
+        for each in read_journal(path):
+            writer.append(each)
 
 
-def metadata(path):
-    """What cannot be read calls no video broken."""
+def check_metadata(path):
     assert is_broken(path) in (True, False)
 
 
 @pytest.mark.parametrize(
-    ("name", "sound", "read"),
+    ("pattern", "check"),
     [
-        ("manifest.0.7.manifest.json", MANIFEST, manifest),
-        ("episode_batch.0.7.stats.json", STATS, statistics),
-        ("episodes.0.7.jsonl", ENTRY, journal),
-        ("video.0.7.video000000.meta.json", METADATA, metadata),
+        ("*.manifest.json", check_manifest),
+        ("*.stats.json", check_statistics),
+        ("*.jsonl", check_journal),
+        ("*.meta.json", check_metadata),
     ],
 )
-def test_every_file_with_one_thing_wrong(tmp_path, name, sound, read):
-    """Each thing in it replaced by each nasty one, and left out."""
-    path = tmp_path / f"openaigym.{name}"
-    for value in spoilt(sound):
+def test_json_files_with_one_bad_value(tmp_path, pattern, check):
+    valid = tmp_path / "valid"
+    valid.mkdir()
+    write_valid(valid)
+    [file] = valid.glob(pattern)
+    path = tmp_path / file.name
+    for value in variants(json.loads(file.read_text())):
         path.write_text(json.dumps(value))
         try:
-            read(path)
+            check(path)
         except UnreadableFile as error:
             check_refusal(error, path)
 
@@ -155,33 +134,14 @@ def check_refusal(error, path):
     assert len(str(error)) < 2000 + len(str(path))
 
 
-VALUES = st.recursive(
-    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
-    lambda inner: st.one_of(
-        st.lists(inner, max_size=3), st.dictionaries(st.text(), inner, max_size=3)
-    ),
-    max_leaves=6,
-)
-
-
-@FEW
-@given(value=VALUES)
-def test_any_value_can_be_written_and_read(value):
-    """And gives the same text again."""
-    assert dumps(loads(dumps(value))) == dumps(value)
-
-
 @pytest.mark.parametrize(
     "value",
     [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
 )
-def test_keys_that_would_be_written_as_the_same_come_back(value):
-    """Shown as Python shows them: a text with a key twice would be refused."""
+def test_keys_with_equal_text_are_written_as_repr(value):
     assert "repr" in dumps(value)
     assert dumps(loads(dumps(value))) == dumps(value)
 
-
-# --- a recording in flight -----------------------------------------------------------
 
 NAME = trajectory_prefix(INFIX, 0)
 JOURNAL, LOG = journal_name(INFIX), log_name(INFIX, 0)
@@ -199,8 +159,7 @@ DAMAGE = st.lists(
 )
 
 
-def damaged(data, damage):
-    """Return `data` with bytes flipped, set, overwritten, cut off or put in."""
+def apply_damage(data, damage):
     for place, what, byte, number in damage:
         if not data:
             break
@@ -218,8 +177,8 @@ def damaged(data, damage):
 
 
 @pytest.fixture(scope="module")
-def sound_log(tmp_path_factory):
-    """The files of a recording, by their names."""
+def valid_log(tmp_path_factory):
+    """The content of a recording's files by name."""
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
     packed = pack_change(1, ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
@@ -231,7 +190,7 @@ _numbers = itertools.count()
 
 
 def read_log(tmp_path, files):
-    """Return what is read, None where there is one error that names a file of it."""
+    """Return the content, or None after one error that names one of its files."""
     directory = tmp_path / str(next(_numbers))
     directory.mkdir()
     for name, content in files.items():
@@ -249,22 +208,20 @@ def read_log(tmp_path, files):
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_every_line_with_one_thing_wrong(tmp_path, sound_log, number):
-    """Of a journal; what is relied on in rendering is looked at there."""
-    lines = sound_log[JOURNAL].splitlines()
+def test_journal_lines_with_one_bad_value(tmp_path, valid_log, number):
+    lines = valid_log[JOURNAL].splitlines()
     assert len(lines) == 4
-    for value in spoilt(json.loads(lines[number])):
+    for value in variants(json.loads(lines[number])):
         changed = [*lines[:number], json.dumps(value).encode(), *lines[number + 1 :]]
         content = b"".join(line + b"\n" for line in changed)
-        read_log(tmp_path, {**sound_log, JOURNAL: content})
+        read_log(tmp_path, {**valid_log, JOURNAL: content})
 
 
 @FEW
 @given(part=st.sampled_from([JOURNAL, LOG, LOOKS]), damage=DAMAGE)
-def test_any_damaged_log(tmp_path, sound_log, part, damage):
-    """Bytes changed anywhere in one of its files."""
-    content = damaged(sound_log[part], damage)
-    found = read_log(tmp_path, {**sound_log, part: content})
+def test_damaged_log_files(tmp_path, valid_log, part, damage):
+    content = apply_damage(valid_log[part], damage)
+    found = read_log(tmp_path, {**valid_log, part: content})
     if found is not None:
         assert len(found.states) <= 5
         assert len(found.rewards) == max(0, len(found.states) - 1)
@@ -275,15 +232,15 @@ def test_any_damaged_log(tmp_path, sound_log, part, damage):
 
 @FEW
 @given(damage=DAMAGE, written=st.integers(0, 4))
-def test_any_damaged_tail(tmp_path, sound_log, damage, written):
-    """Rows are taken from it as far as they say that they are the next ones."""
-    rows = sound_log[LOG]
+def test_damaged_tail(tmp_path, valid_log, damage, written):
+    """Its rows are read as long as their numbers continue."""
+    rows = valid_log[LOG]
     size = len(rows) // 5
     head = struct.pack("=QQQ", 5, size // 8, 5)
-    # Where it counts: most of a head is nothing.
-    place = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
-    tail = damaged(head + rows, place)
+    # Half of the damage hits the head, which is short.
+    placed = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
+    tail = apply_damage(head + rows, placed)
     tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]
-    files = {**sound_log, LOG: rows[: written * size], TAIL: tail}
+    files = {**valid_log, LOG: rows[: written * size], TAIL: tail}
     found = read_log(tmp_path, files)
     assert found is None or written <= len(found.states) <= 5

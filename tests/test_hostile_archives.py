@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Archives that are made to do harm to whoever verifies them."""
+"""Malicious archives are refused before they can harm a verifier."""
 
 import os
 import stat
@@ -16,93 +16,90 @@ import pytest
 import mjrec
 from mjrec.evidence.archive import bring_in
 
-GOOD = "run/data/recordings/openaigym.episodes.0.7.jsonl"
-EVIL = Path("/tmp/evil-of-mjrec-tests")
+NAME = "run/data/recordings/openaigym.episodes.0.7.jsonl"
+OUTSIDE = Path("/tmp/evil-of-mjrec-tests")
 TABLE = b"PK\x01\x02"
 
 
 def write(path, *entries, comment=b"", **options):
-    """Write a zip file as it would never come from us."""
     with warnings.catch_warnings(), zipfile.ZipFile(path, "w", **options) as file:
-        warnings.simplefilter("ignore")  # of names that are there twice
+        warnings.simplefilter("ignore")  # of duplicate names
         for name, content in entries:
             file.writestr(name, content)
         file.comment = comment
 
 
-def writes(*entries, **options):
+def writer(*entries, **options):
     return lambda path: write(path, *entries, **options)
 
 
-def entry(name=GOOD, **facts):
-    """Return an entry whose name is taken as it is."""
+def entry(name=NAME, **facts):
+    """Return an entry that keeps an invalid name."""
     info = zipfile.ZipInfo("x")
     for key, value in {"filename": name, **facts}.items():
         setattr(info, key, value)
     return info
 
 
-def write_called(name, path, mode=0):
-    write(path, (GOOD, b""), (entry(name, external_attr=mode << 16), b"/etc/passwd"))
+def write_named(name, path, mode=0):
+    write(path, (NAME, b""), (entry(name, external_attr=mode << 16), b"/etc/passwd"))
 
 
 def damage(change, path):
-    """Write a sound archive with other bytes in it."""
-    write(path, (GOOD, os.urandom(1000)), compression=zipfile.ZIP_DEFLATED)
+    write(path, (NAME, os.urandom(1000)), compression=zipfile.ZIP_DEFLATED)
     data = bytearray(path.read_bytes())
     changed = change(data)
     path.write_bytes(data if changed is None else changed)
 
 
-def stating(size, data):
-    """What is said to be small is counted while it is unpacked."""
+def declare_size(size, data):
     for place in (22, data.index(TABLE) + 24):
         struct.pack_into("<L", data, place, size)
 
 
-def encrypted(data):
+def encrypt(data):
     data[6] |= 1
     data[data.index(TABLE) + 8] |= 1
 
 
-def one_bit(data):
+def flip_bit(data):
     data[500] ^= 1
 
 
-def with_bytes_between(data):
+def insert_bytes(data):
     table = data.index(TABLE)
     moved = bytearray(data[:table] + b"evil" + data[table:])
     struct.pack_into("<L", moved, len(moved) - 6, table + 4)
     return moved
 
 
-def bomb(path):
-    write(path, (GOOD, bytes(80 << 20)), compression=zipfile.ZIP_DEFLATED)
+def write_bomb(path):
+    write(path, (NAME, bytes(80 << 20)), compression=zipfile.ZIP_DEFLATED)
 
 
-def two_entries_over_the_same_bytes(path):
-    """As in bombs that unpack one content any number of times."""
+def write_overlapping(path):
+    """Write two entries over the same bytes, as bombs do."""
     write(path, ("run/data/a", b"1"), ("run/data/b", b"2"))
     data = bytearray(path.read_bytes())
     struct.pack_into("<L", data, data.rindex(TABLE) + 42, 0)
     path.write_bytes(data)
 
 
-def with_two_tables(path):
-    """Python follows a record of large archives; others see none, for it hides."""
+def write_two_tables(path):
+    """Hide the table that Python reads from other programs."""
     evil = "run/data/evil"
-    begin = 30 + len(GOOD) + 1  # the second file, which holds the table that all see
+    begin = 30 + len(NAME) + 1  # the second file, which holds the visible table
     table = begin + 30 + len(evil)
-    hidden_size = 46 + len(GOOD) + 46 + len(evil)
+    hidden_size = 46 + len(NAME) + 46 + len(evil)
     rest = hidden_size + 56 + 20
     extra = struct.pack("<2H", 0x5455, rest)
-    seen = listing(GOOD, b"1", 0, len(extra) + rest) + extra
-    hidden = listing(GOOD, b"1", 0) + listing(evil, seen, begin)
+    seen = listing(NAME, b"1", 0, len(extra) + rest) + extra
+    hidden = listing(NAME, b"1", 0) + listing(evil, seen, begin)
     place = table + len(seen)
     large = (b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, place)
     end = (b"PK\5\6", 0, 0, 1, 1, len(seen) + rest, table, 0)
     path.write_bytes(
-        stored(GOOD, b"1")
+        stored(NAME, b"1")
         + stored(evil, seen)
         + hidden
         + struct.pack("<4sQ2H2L4Q", *large)
@@ -123,15 +120,15 @@ def listing(name, content, offset, extra=0):
     return struct.pack("<4s6H3L5H2L", TABLE, *facts) + name.encode()
 
 
-def with_a_second_name(path):
-    """Info-ZIP shows the name in this field, and Python the other one."""
-    called = b"\x01" + struct.pack("<L", zlib.crc32(GOOD.encode())) + b"run/data/evil"
+def write_second_name(path):
+    """Write an entry that Info-ZIP and Python show under different names."""
+    called = b"\x01" + struct.pack("<L", zlib.crc32(NAME.encode())) + b"run/data/evil"
     extra = struct.pack("<2H", 0x7075, len(called)) + called
     write(path, (entry(extra=extra), b"1"))
 
 
-def linked_folder(path):
-    """An unpacked run whose recordings lie elsewhere."""
+def link_folder(path):
+    """Make an unpacked run whose recordings lie elsewhere."""
     elsewhere = path.with_name("elsewhere")
     (elsewhere / "recordings").mkdir(parents=True)
     path.mkdir()
@@ -140,9 +137,9 @@ def linked_folder(path):
 
 
 NAMES = [
-    # They lead elsewhere, whatever the system.
+    # They lead elsewhere on some system.
     *(("../evil", "leads out"), ("run/../../evil", "leads out")),
-    *(("run/..", "leads out"), (str(EVIL), "absolute")),
+    *(("run/..", "leads out"), (str(OUTSIDE), "absolute")),
     *(("C:/evil", "absolute"), ("run\\..\\..\\evil", "backslash")),
     *(("run/a\0b", "invisible character"), ("run/a\nb", "invisible character")),
     *(("run//evil", "empty part"), ("run/./evil", "empty part")),
@@ -150,49 +147,51 @@ NAMES = [
     (f"run/{'e/' * 20}e", "folders deep"),
 ]
 PAIRS = [
-    # Two files of one name, on any system, or more than one folder.
+    # Two files of one name on some system, or more than one folder.
     *(("run/data/a", "run/data/a", "same file"), ("run/data/a", "run/data/A", "same")),
     ("run/data/\u00e4", "run/data/a\u0308", "same file"),
     *(("run/data/a", "run/data/a/b", "the folder"), ("run/data/a", "a", "one folder")),
     ("run/data/a", "other/a", "one folder"),
 ]
 DAMAGES = [
-    *((partial(stating, 5), "CRC"), (partial(stating, 5000), "the declared size")),
-    *((encrypted, "encrypted"), (one_bit, "CRC")),
-    # What some programs see and others do not.
-    (with_bytes_between, "hidden bytes"),
+    (partial(declare_size, 5), "CRC"),
+    (partial(declare_size, 5000), "the declared size"),
+    *((encrypt, "encrypted"), (flip_bit, "CRC")),
+    # Bytes that some programs read and others skip.
+    (insert_bytes, "hidden bytes"),
     (lambda data: b"evil" + data, "before its first file"),
     (lambda data: data + b"evil", "at its end"),
-    # A download that broke off.
+    # An incomplete download.
     *((lambda data, n=n: data[:n], "not a zip file") for n in (0, 10, 200)),
 ]
-# A link could be written through, and a device opened.
 MODES = [stat.S_IFLNK | 0o777, stat.S_IFCHR | 0o666, stat.S_IFIFO]
 NO_FILE = "neither a file nor a folder"
-HARMS = [
-    *((partial(write_called, name), reason) for name, reason in NAMES),
-    *((partial(write_called, "run/data/link", mode=m), NO_FILE) for m in MODES),
-    *((writes((a, b"1"), (b, b"2")), reason) for a, b, reason in PAIRS),
+ATTACKS = [
+    *((partial(write_named, name), reason) for name, reason in NAMES),
+    *((partial(write_named, "run/data/link", mode=m), NO_FILE) for m in MODES),
+    *((writer((a, b"1"), (b, b"2")), reason) for a, b, reason in PAIRS),
     *((partial(damage, change), reason) for change, reason in DAMAGES),
-    (writes((GOOD, b"1"), comment=b"evil"), "has a comment"),
-    (writes((entry(comment=b"evil"), b"1")), "has a comment"),
-    (with_a_second_name, "not all programs read"),
-    (writes((GOOD, b"1"), ("run/All succeeded/", b"")), "is an empty"),
-    (bomb, "zip bomb"),
-    (writes(*((f"r/{n}", b"") for n in range(100_001))), "more than the limit"),
-    (two_entries_over_the_same_bytes, "overlaps"),
-    (with_two_tables, "two tables"),
-    (writes((GOOD, b"1"), compression=zipfile.ZIP_BZIP2), "unsupported compression"),
-    (writes(("run/readme.txt", b"1")), "data/recordings"),
-    (linked_folder, NO_FILE),
+    (writer((NAME, b"1"), comment=b"evil"), "has a comment"),
+    (writer((entry(comment=b"evil"), b"1")), "has a comment"),
+    (write_second_name, "not all programs read"),
+    (writer((NAME, b"1"), ("run/All succeeded/", b"")), "is an empty"),
+    (write_bomb, "zip bomb"),
+    (writer(*((f"r/{n}", b"") for n in range(100_001))), "more than the limit"),
+    (write_overlapping, "overlaps"),
+    (write_two_tables, "two tables"),
+    (writer((NAME, b"1"), compression=zipfile.ZIP_BZIP2), "unsupported compression"),
+    (writer(("run/readme.txt", b"1")), "data/recordings"),
+    (link_folder, NO_FILE),
 ]
 
 
 @pytest.mark.parametrize(
-    ("make", "reason"), HARMS, ids=[f"{n} {why}" for n, (_, why) in enumerate(HARMS)]
+    ("make", "reason"),
+    ATTACKS,
+    ids=[f"{n} {why}" for n, (_, why) in enumerate(ATTACKS)],
 )
-def test_harm_is_refused(make, reason, tmp_path):
-    """With its reason; nothing is written outside of the folder for it."""
+def test_malicious_archive_is_refused(make, reason, tmp_path):
+    """Nothing is written outside its folder."""
     archive, place = tmp_path / "run.zip", tmp_path / "place"
     make(archive)
     before = sorted(tmp_path.rglob("*"))
@@ -201,16 +200,16 @@ def test_harm_is_refused(make, reason, tmp_path):
         bring_in(archive, place / "given")
     outside = [path for path in tmp_path.rglob("*") if place not in path.parents]
     assert sorted(outside) == sorted([*before, place])
-    assert not EVIL.exists()
+    assert not OUTSIDE.exists()
 
 
-def test_harm_in_a_verification_is_refused(tmp_path, monkeypatch):
-    """By the process that unpacks, of which nothing is left; it says what to do."""
+def test_verification_refuses_malicious_archives(tmp_path, monkeypatch):
+    """It leaves no files, and the error says what to do."""
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     archive = tmp_path / "run.zip"
-    write_called("../evil", archive)
+    write_named("../evil", archive)
     with pytest.raises(mjrec.UnreadableArchive, match="leads out"):
         mjrec.verify(archive, level="files")
     assert list(temporary.iterdir()) == []
@@ -221,10 +220,9 @@ def test_harm_in_a_verification_is_refused(tmp_path, monkeypatch):
     assert "directory" not in str(e.value)
 
 
-def test_archive_that_does_not_fit_on_the_disk_is_an_error(tmp_path, monkeypatch):
-    """Before anything is written, and with the room that it takes."""
+def test_archive_larger_than_the_free_disk_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "run.zip"
-    write(path, (GOOD, bytes(1000)))
+    write(path, (NAME, bytes(1000)))
     usage = type("Usage", (), {"free": 999})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
     with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, but only 999 are free"):

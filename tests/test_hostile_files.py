@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of somebody who means harm: one error, soon, and nothing else is touched.
+"""Malicious files: each gives one error, soon, and touches nothing else.
 
 Each is read in a fork with a gigabyte of memory (`hostile_reading`).
 """
@@ -7,6 +7,7 @@ Each is read in a fork with a gigabyte of memory (`hostile_reading`).
 import contextlib
 import gzip
 import hashlib
+import io
 import json
 import os
 import re
@@ -14,7 +15,6 @@ import socket
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from sound_files import (
     journal_of_killed,
     manifest,
     metadata,
-    stored,
+    store_model,
 )
 from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
@@ -55,13 +55,11 @@ from mjrec.simulation.model_trust import note_models
 
 NAME = trajectory_prefix(INFIX, 0)
 
-Harm = Callable[[Path], object]
-
 
 @pytest.fixture(scope="module")
 def inspector():
-    with Inspector() as one:
-        yield one
+    with Inspector() as inspector:
+        yield inspector
 
 
 @pytest.fixture
@@ -72,22 +70,19 @@ def directory(tmp_path):
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_a_sound_file_is_read(inspector, directory, kind):
-    """So that what is refused below is refused for its harm."""
+def test_valid_file_is_read(inspector, directory, kind):
+    """The tests below then refuse a file for its damage alone."""
     reader, write = FILES[kind]
     inspector.reads(reader, write(directory))
 
 
-# --- what is no file at all ----------------------------------------------------------
-
-
 def listening_socket(path):
-    # By a relative name, because those of sockets are short.
+    # A socket's path must be short.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path.name)
 
 
-PUT = {
+PATHS = {
     "pipe": os.mkfifo,
     "folder": Path.mkdir,
     "socket": listening_socket,
@@ -97,28 +92,26 @@ PUT = {
         path.parents[1] / "ours" / path.name
     ),
 }
-FINE = {
-    # A file that the user names is the user's, links and all.
-    ("mjcf", "link elsewhere"),
-    # A directory is an answer that lists what is in it.
-    ("h5", "folder"),
+ALLOWED = {
+    ("mjcf", "link elsewhere"),  # the user named it
+    ("h5", "folder"),  # its files are listed
 }
 
 
 @pytest.mark.parametrize(
-    ("kind", "put"), [(k, p) for k in FILES for p in PUT if (k, p) not in FINE]
+    ("kind", "put"), [(k, p) for k in FILES for p in PATHS if (k, p) not in ALLOWED]
 )
-def test_only_regular_files_of_the_directory_are_opened(
+def test_only_regular_files_in_the_directory_are_opened(
     inspector, directory, kind, put
 ):
-    """No pipe is waited for, no device opened, no link followed, nothing removed."""
+    """Readers wait for no pipe, open no device, follow no link and remove nothing."""
     reader, write = FILES[kind]
     path = write(directory)
     outside = directory.with_name("ours") / path.name
     outside.parent.mkdir()
     path.rename(outside)
     os.utime(outside, (0, outside.stat().st_mtime))
-    PUT[put](path)
+    PATHS[put](path)
     before = sorted(directory.iterdir())
     inspector.refuses(reader, path)
     assert outside.stat().st_atime == 0
@@ -127,7 +120,6 @@ def test_only_regular_files_of_the_directory_are_opened(
 
 
 def test_links_within_the_directory_are_followed(directory):
-    """As are the user's own, from elsewhere, that bear no monitor file's name."""
     path = finished(directory)
     kept = path.rename(directory / "kept.h5")
     path.symlink_to(kept.name)
@@ -136,40 +128,35 @@ def test_links_within_the_directory_are_followed(directory):
     assert len(load_trajectory(path)) == len(load_trajectory(latest)) == 4
 
 
-# --- what is not what its name says --------------------------------------------------
-
-
-def a_hole_of_a_terabyte(path):
+def grow_to_terabyte(path):
     path.write_bytes(path.read_bytes()[:-1])
     os.truncate(path, 1 << 40)
 
 
-SPOILS = {
-    "nothing": lambda path: path.write_bytes(b""),
+CORRUPTIONS = {
+    "empty": lambda path: path.write_bytes(b""),
     "noise": lambda path: path.write_bytes(np.random.default_rng(1).bytes(5000)),
-    "a hole of a terabyte": a_hole_of_a_terabyte,
-    "half of it": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "sparse terabyte": grow_to_terabyte,
+    "cut in half": lambda path: os.truncate(path, path.stat().st_size // 2),
 }
 
 
-@pytest.mark.parametrize("spoil", SPOILS)
+@pytest.mark.parametrize("corruption", CORRUPTIONS)
 @pytest.mark.parametrize("kind", [k for k in FILES if k != "video for an archive"])
-def test_other_content_is_refused(inspector, directory, kind, spoil):
-    """Of a journal and of logs there is what is whole; the rest is passed over."""
+def test_corrupt_content_is_refused(inspector, directory, kind, corruption):
+    """Journals and logs may be read up to the damage."""
     reader, write = FILES[kind]
     path = write(directory)
-    SPOILS[spoil](path)
+    CORRUPTIONS[corruption](path)
     if kind == "journal":
         os.truncate(path, min(path.stat().st_size, 1 << 28))
-    # MuJoCo reads what the user has named as it likes.
-    may_be_read = {"mjcf", "spans"} if "hole" in spoil else set()
+    # MuJoCo decides how it reads a file that the user named.
+    may_be_read = {"mjcf", "spans"} if corruption == "sparse terabyte" else set()
     if kind in {"journal", ".log", ".tail", ".looks"} | may_be_read:
         assert inspector.read(reader, path).kind in ("value", "refused")
     else:
         inspector.refuses(reader, path)
 
-
-# --- JSON ----------------------------------------------------------------------------
 
 JSON = {
     "nested too deeply": b"[" * 10_000_000,
@@ -183,10 +170,7 @@ JSON = {
 }
 
 
-# --- trajectories --------------------------------------------------------------------
-
-
-def in_hdf5(change, path):
+def edit_hdf5(change, path):
     with h5py.File(path, "r+") as file:
         change(file)
 
@@ -199,8 +183,8 @@ def replaced(name, **options):
     return replace
 
 
-def virtual(file):
-    """A dataset put together of files that are counted when its shape is asked for."""
+def virtual_dataset(file):
+    """Make a dataset whose shape depends on how many files exist."""
     whole = h5py.h5s.create_simple((4,), (h5py.h5s.UNLIMITED,))
     whole.select_hyperslab((0,), (h5py.h5s.UNLIMITED,), (1,), (1,))
     part = h5py.h5s.create_simple((1,))
@@ -216,21 +200,21 @@ def overflowing_frames(file):
     replaced("snapshots", data=np.zeros(5, file["snapshots"].dtype))(file)
 
 
-def change_of(file):
+def add_change(file):
     group = file["model_changes"].create_group("0")
     group.attrs["step"] = np.int64(0)
     return group
 
 
-def one_change_by_many_names(file):
-    zeros, group = np.zeros(4 << 20), change_of(file)
+def thousands_of_links_to_one_change(file):
+    zeros, group = np.zeros(4 << 20), add_change(file)
     group.create_dataset("geom_rgba", data=zeros, compression=9, chunks=zeros.shape)
     for index in range(1, 5000):
         file["model_changes"][str(index)] = group
 
 
 def gigabytes_of_observations(file):
-    """Four, out of four megabytes: zeros pack a thousandfold."""
+    """Compress four gigabytes of zeros to four megabytes."""
     rows, length = 500, 1 << 20
     for name, kind in [("rewards", "f8"), ("terminated", "?"), ("truncated", "?")]:
         replaced(name, data=np.zeros(rows - 1, kind))(file)
@@ -244,39 +228,65 @@ def gigabytes_of_observations(file):
 
 
 def linked_field(file):
-    change_of(file)["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
+    add_change(file)["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def linked_rewards(file):
+    del file["rewards"]
+    file["rewards"] = h5py.ExternalLink("other.h5", "/x")
 
 
 def object_field(file):
-    texts = {"data": [b"cos\nsystem"], "dtype": h5py.string_dtype()}
-    change_of(file).create_dataset("x", **texts)
+    group, kind = add_change(file), h5py.string_dtype()
+    group.create_dataset("x", data=[b"cos\nsystem"], dtype=kind)
 
 
-# Of one the process is ended when it has had its CPU time, which takes a while.
 HDF5 = [
-    (virtual, "in a way that mjrec does not write"),
+    (virtual_dataset, "in a way that mjrec does not write"),
     (overflowing_frames, "out of order"),
     (replaced("states", shape=(5, 2**35), dtype="f8"), "C int"),
     (replaced("rewards", shape=(2**40,), dtype="f8"), "more memory"),
     (replaced("rewards", shape=(2**40,), dtype="f8", chunks=(9,)), "more memory"),
     (gigabytes_of_observations, "more memory"),
-    (one_change_by_many_names, "SIGXCPU|SIGKILL"),
+    (thousands_of_links_to_one_change, "SIGXCPU|SIGKILL"),
     (linked_field, "no 'geom_rgba' of its own"),
     (object_field, "not a valid dtype"),
     (lambda file: file.attrs.create("format_version", True), "wrong type"),
+    (lambda file: file.attrs.update(format="mjrec trajectory"), "has the wrong type"),
+    (lambda file: file.attrs.update(format=np.bytes_(b"hdf5")), "not a trajectory"),
+    (lambda file: file.attrs.update(format_version=np.int64(2)), "update mjrec"),
+    (lambda file: file.attrs.update(facts=np.bytes_(b"{}")), "its facts are damaged"),
+    (
+        lambda file: file.create_dataset("actions", data=np.zeros((3, 3))),
+        "the same number of steps",
+    ),
+    (replaced("states", data=np.zeros(5, "f4,f4")), "components that are not float64"),
+    (replaced("rewards", data=["a"] * 4), "not a valid dtype"),
+    (replaced("rewards", data=np.zeros((4, 2))), "rewards have"),
+    (replaced("snapshots", data=np.zeros(5)), "the snapshot of a row"),
+    (replaced("frame_steps", data=np.arange(5)[::-1]), "frame steps are out of order"),
+    (
+        replaced("rewards", shape=4, dtype="<f8", external=[("/etc/passwd", 0, 32)]),
+        "in a way that mjrec does not write",
+    ),
+    (
+        replaced("rewards", data=np.ones(4), chunks=(4,), compression="lzf"),
+        "rewards is stored in a way",
+    ),
+    (linked_rewards, "no 'rewards' of its"),
+    (replaced("model_changes", data=np.zeros(3)), "is not a group"),
+    (lambda file: file.__delitem__("truncated"), "no 'truncated' of its own"),
+    (lambda file: file.create_group("model_changes/9"), "no '0' of its"),
 ]
 
 
-# --- recordings in flight ------------------------------------------------------------
-
-
-def head(rows, version=1):
-    """Return the first line of somebody else's journal."""
+def first_line(rows, version=1):
+    """Return the first line of a foreign journal."""
     values = {"number": 0, "version": version, "dtype": rows, "facts": {}}
     return json.dumps({"rows": values}).encode() + b"\n"
 
 
-def beginning_with(line, path):
+def replace_first_line(line, path):
     path.write_bytes(line + b"".join(path.read_bytes().splitlines(True)[1:]))
 
 
@@ -298,18 +308,15 @@ CHANGES = (
 )
 
 
-def with_change(header, path):
-    """Put an array with another header where the changes to the model are."""
+def write_change(header, path):
+    """Write a model change whose array has this header."""
     start = b"\x93NUMPY\1\0" + struct.pack("<H", len(header))
     payload = start + header.encode() + bytes(8)
     path.write_bytes(struct.pack("<QqQ", 0, 0, len(payload)) + payload)
 
 
-# --- models --------------------------------------------------------------------------
-
-
-def put_compiled(content, packed, path, **facts):
-    """Put bytes in place of a compiled model, with facts that are true."""
+def replace_compiled_model(content, packed, path, **facts):
+    """Replace a compiled model by other bytes, with matching facts."""
     digest = hashlib.sha256(content).hexdigest()
     facts = {"sha256": digest, "bytes": len(content), "mjb": path.name, **facts}
     facts |= {"mujoco": mujoco.__version__, "xml": None}
@@ -319,36 +326,34 @@ def put_compiled(content, packed, path, **facts):
 
 
 CONTENT = bytes(1000)
-SOUND = gzip.compress(CONTENT)
+VALID = gzip.compress(CONTENT)
 NOISE = np.random.default_rng(1).bytes(10_000)
 BOMB = gzip.compress(bytes(1 << 28))
 GZIP = [
-    # No model, a bomb, and one that says how large it is.
-    lambda path: put_compiled(NOISE, gzip.compress(NOISE), path),
-    partial(put_compiled, CONTENT, BOMB),
-    partial(put_compiled, CONTENT, BOMB, bytes=(1 << 31) - 1),
+    partial(replace_compiled_model, NOISE, gzip.compress(NOISE)),
+    partial(replace_compiled_model, CONTENT, BOMB, bytes=(1 << 31) - 1),
     *(
-        partial(put_compiled, CONTENT, packed)
+        partial(replace_compiled_model, CONTENT, packed)
         for packed in (
-            SOUND + gzip.compress(b"more"),
-            gzip.compress(b"") * 100_000 + SOUND,
+            VALID + gzip.compress(b"more"),
+            gzip.compress(b"") * 100_000 + VALID,
             # An endless name.
-            SOUND[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
+            VALID[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
             # Cut off, a wrong checksum, bytes at the end.
-            *(SOUND[:-1], SOUND[:-8] + bytes(8), SOUND + b"tail"),
+            *(VALID[:-1], VALID[:-8] + bytes(8), VALID + b"tail"),
         )
     ),
 ]
 
 
-def put_zip(members, path, *, again=None):
+def write_zip(members, path, *, duplicate=None):
     contents = b'{"format": 1, "main": "main.xml"}'
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"contents.json": contents, **members}.items():
             archive.writestr(name, content)
-        if again is not None:
+        if duplicate is not None:
             with pytest.warns(UserWarning, match="Duplicate"):
-                archive.writestr(again, b"other")
+                archive.writestr(duplicate, b"other")
 
 
 def npy(header):
@@ -356,8 +361,14 @@ def npy(header):
     return b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text + bytes(64)
 
 
+def field(name, value):
+    buffer = io.BytesIO()
+    np.save(buffer, value)
+    return {f"fields/{name}.npy": buffer.getvalue()}
+
+
 MAIN = "source/main.xml"
-SOUND_ZIP = {MAIN: SPHERE.encode()}
+VALID_ZIP = {MAIN: SPHERE.encode()}
 HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}")
 ZIP = {
     "more memory than": {"fields/geom_rgba.npy": HUGE},
@@ -367,9 +378,15 @@ ZIP = {
     "nested too deeply": {"contents.json": b"[" * 100_000},
     "other": {"contents.json": b'{"format": 1, "main": "other"}'},
     "dict": {"contents.json": b'{"format": 1, "main": {}}'},
+    # An index that MuJoCo would trust, objects, and names of other things.
+    "set from": field("geom_bodyid", np.array([10**6], np.int32)),
+    "no model field .opt": field("opt.__class__", np.zeros(())),
+    "Object arrays cannot be loaded": field("geom_rgba", np.array([[None] * 4])),
+    "another model": field("geom_rgba", np.zeros((9, 4), np.float32)),
+    "no model field .aura": field("aura", np.zeros(1)),
 }
 INSIDE = "<mujoco><worldbody>%s</worldbody></mujoco>"
-# A megabyte of names would be looked at a thousand million times.
+# A megabyte of names, to search 400 million times.
 MANY = "".join(f'<compiler meshdir="d{i}"/>' for i in range(20_000))
 MESHES = "".join(f'<mesh file="{i}"/>' for i in range(20_000))
 MJCF = (
@@ -387,35 +404,40 @@ MJCF = (
     f"<mujoco>{MANY}<asset>{MESHES}</asset></mujoco>",
 )
 
-# The kind of file, what is done to it, and what is said of it.
-HARMS = [
+# The kind of file, the attack, and the error.
+ATTACKS = [
+    *(("manifest", partial(Path.write_bytes, data=d), e) for e, d in JSON.items()),
+    *(("h5", partial(edit_hdf5, change), e) for change, e in HDF5),
     *(
-        ("manifest", partial(Path.write_bytes, data=d), said)
-        for said, d in JSON.items()
+        ("spans", partial(replace_first_line, first_line(rows)), e)
+        for e, rows in ROWS.items()
     ),
-    *(("h5", partial(in_hdf5, change), said) for change, said in HDF5),
-    *(("spans", partial(beginning_with, head(r)), said) for said, r in ROWS.items()),
-    ("spans", partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
-    *((".looks", partial(with_change, h), "change to the model") for h in CHANGES),
-    *(("mjb.gz", harm, "") for harm in GZIP),
-    *(("zip", partial(put_zip, {**SOUND_ZIP, **m}), said) for said, m in ZIP.items()),
-    ("zip", partial(put_zip, SOUND_ZIP, again=MAIN), "is not XML"),
-    *(("zip", partial(put_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
+    ("spans", partial(replace_first_line, b"[" * 10**7 + b"\n"), "does not give"),
+    *((".looks", partial(write_change, h), "change to the model") for h in CHANGES),
+    *(("mjb.gz", attack, "") for attack in GZIP),
+    ("mjb.gz", partial(replace_compiled_model, CONTENT, BOMB), "more than the record"),
+    (
+        *("mjb.gz", partial(replace_compiled_model, CONTENT, BOMB, bytes=1 << 50)),
+        "recorded size is",
+    ),
+    *(("zip", partial(write_zip, {**VALID_ZIP, **m}), e) for e, m in ZIP.items()),
+    ("zip", partial(write_zip, VALID_ZIP, duplicate=MAIN), "is not XML"),
+    *(("zip", partial(write_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
 ]
 
 
-# Takes more than five seconds: one file is given up when it has had its CPU time.
+# Takes more than five seconds: one file uses up its limit of CPU time.
 @pytest.mark.parametrize(
-    ("kind", "harm", "said"),
-    HARMS,
-    ids=[f"{number} {kind} {said}" for number, (kind, _, said) in enumerate(HARMS)],
+    ("kind", "attack", "error"),
+    ATTACKS,
+    ids=[f"{number} {kind} {error}" for number, (kind, _, error) in enumerate(ATTACKS)],
 )
-def test_harm_is_one_error(inspector, directory, kind, harm, said):
-    """Before anything of it is used, within memory and time, and with its reason."""
+def test_attack_gives_one_error(inspector, directory, kind, attack, error):
+    """The error names the reason, within limits of memory and time."""
     reader, write = FILES[kind]
     path = write(directory)
-    harm(path)
-    assert re.search(said, inspector.refuses(reader, path))
+    attack(path)
+    assert re.search(error, inspector.refuses(reader, path))
 
 
 NOTE = b'{"note": {"name": "%s", "facts": {"a": %%s}}}\n' % NAME.encode()
@@ -430,57 +452,53 @@ NOTE = b'{"note": {"name": "%s", "facts": {"a": %%s}}}\n' % NAME.encode()
         b"a" * (200 << 20),
         b"{\n" * 50_000,
     ],
-    ids=["nested", "a fact twice", "large facts", "an endless line", "no lines"],
+    ids=["nested", "duplicate fact", "large facts", "endless line", "no objects"],
 )
-def test_hostile_lines_about_rows_take_little(inspector, directory, lines):
-    """Time and memory; what was said before counts."""
+def test_hostile_journal_lines_take_little_time_and_memory(inspector, directory, lines):
+    """The valid lines before them still count."""
     journal = journal_of_killed(directory)
     with journal.open("ab") as file:
         file.write(lines)
     inspector.reads("finish", journal)
 
 
-def put_journal(directory, name, version=1):
-    """Put a journal of somebody else's there that names a recording."""
+def write_foreign_journal(directory, name, version=1):
     begin = {"name": name, "log": 0, "rows": 0, "row": 0, "look": 0, "facts": {}}
     path, line = directory / journal_name(INFIX), json.dumps({"begin": begin})
-    path.write_bytes(head(DTYPE.descr, version) + line.encode() + b"\n")
+    path.write_bytes(first_line(DTYPE.descr, version) + line.encode() + b"\n")
     (directory / log_name(INFIX, 0)).touch()
     return path
 
 
-def test_only_names_of_the_monitor_are_believed(directory):
-    """No path leads out of the directory, or to another monitor's files."""
+def test_journal_names_only_its_own_recordings(directory):
+    """No path leads out of the directory or to another monitor's files."""
     for name in (
         *("../x", "..", "", "a\0b", "\ud800", f"../{NAME}", f"{NAME}.h5", NAME * 9),
         trajectory_prefix("0.2", 27),
         clip_part_name("1.7", 0, 0),
     ):
-        put_journal(directory, name)
+        write_foreign_journal(directory, name)
         assert recordings_in_flight(directory) == [], name
         assert not is_in_flight(directory / f"{NAME}.h5")
-    put_journal(directory, NAME)
+    write_foreign_journal(directory, NAME)
     assert is_in_flight(directory / f"{NAME}.h5")
 
 
-def test_a_newer_format_is_refused_with_the_way_out(directory):
-    """Nothing of it is guessed at, and it is not removed."""
-    journal, log = put_journal(directory, NAME, version=12), log_name(INFIX, 0)
+def test_newer_format_asks_for_an_update(directory):
+    """Its log is neither guessed at nor removed."""
+    journal = write_foreign_journal(directory, NAME, version=12)
     with pytest.raises(UnreadableFile, match=r"newer mjrec in .* 12.* 1: update mjr"):
         load_trajectory(directory / f"{NAME}.h5")
-    remove_if_done(directory / log)
-    assert (directory / log).exists()
-    # One that was cut within its first line is of nothing.
-    for size in (100, 0):
+    log = directory / log_name(INFIX, 0)
+    remove_if_done(log)
+    assert log.exists()
+    for size in (100, 0):  # cut within its first line
         os.truncate(journal, size)
         assert recordings_in_flight(directory) == []
 
 
-# --- names, and what a file says -----------------------------------------------------
-
-
-def test_a_pending_video_elsewhere_is_not_looked_at(directory):
-    """Though its name begins as that of a video of the directory does."""
+def test_names_that_lead_elsewhere_are_ignored(directory):
+    """A pending video's path may begin like a name in the directory."""
     outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
     outside.write_bytes(b"")
     metadata(directory.parent)
@@ -492,15 +510,15 @@ def test_a_pending_video_elsewhere_is_not_looked_at(directory):
     update_manifests(directory)
     assert read_manifest(path).videos == ()
     assert episode_of(name) is None
-    # Reading a number takes longer than its digits are many.
+    # Parsing so long a number would take minutes.
     assert episode_of(f"openaigym.video.0.7.video{'1' * 10**6}.mp4") is None
     assert infix_of("openaigym.episodes.0.7/../x.jsonl") is None
     assert not is_infix("1" * 10**6 + ".7")
     assert not is_infix("0.7/../..")
 
 
-def test_an_environment_in_a_file_is_text(directory):
-    """Nothing that a file names is imported or called, or made an environment of."""
+def test_environment_in_a_file_is_text(directory):
+    """Names in files are never imported, called or made an environment."""
     done = directory / "done"
     environment = {
         "framework": "gymnasium",
@@ -516,17 +534,15 @@ def test_an_environment_in_a_file_is_text(directory):
 
 
 @pytest.mark.parametrize("model", [5, "x", [], {"mjb": "../x"}, {"mjb": {}}])
-def test_what_a_trajectory_says_of_its_model_is_checked(directory, model):
-    """One error, of whatever type it is."""
+def test_invalid_model_facts_are_refused(directory, model):
     trajectory = load_trajectory(write_log(directory, model=model))
     with pytest.raises(UnreadableFile):
         trajectory.model()
 
 
-def test_a_model_change_that_fits_nothing_names_the_file(directory):
-    """And not the field alone."""
+def test_mismatched_model_change_names_the_file(directory):
     logs = new_logs(directory)
-    span = logs.begin(NAME, {"model": stored(directory)}, row_dtype())
+    span = logs.begin(NAME, {"model": store_model(directory)}, row_dtype())
     span.log.add_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
     add_row(span, 0)
     path = logs.path_of(NAME)
@@ -535,8 +551,7 @@ def test_a_model_change_that_fits_nothing_names_the_file(directory):
     assert error.value.path == path
 
 
-def test_a_compiled_model_has_the_name_of_its_content(inspector, directory):
-    """So that one file cannot stand for two models."""
+def test_compiled_model_is_named_after_its_content(inspector, directory):
     path = FILES["mjb.gz"][1](directory)
     other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
     facts = directory / "facts.json"
@@ -544,7 +559,7 @@ def test_a_compiled_model_has_the_name_of_its_content(inspector, directory):
     assert "not the recorded model" in inspector.refuses("model", other)
 
 
-FOR_EVER = INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>'
+ENDLESS = INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>'
 TEN_GIGABYTES = (
     '<mujoco><asset><texture name="t" type="2d" builtin="flat" width="60000" '
     'height="60000"/></asset></mujoco>'
@@ -553,13 +568,13 @@ TEN_GIGABYTES = (
 
 @pytest.mark.parametrize(
     ("xml", "seconds", "reason"),
-    # mujoco 3.3 knows itself that no texture is so large.
-    [(FOR_EVER, 3, "longer than 3 seconds"), (TEN_GIGABYTES, 100, "memory|too large")],
-    ids=["for ever", "ten gigabytes"],
+    # mujoco 3.3 refuses such a texture itself.
+    [(ENDLESS, 3, "longer than 3 seconds"), (TEN_GIGABYTES, 100, "memory|too large")],
+    ids=["endless", "ten gigabytes"],
 )
-def test_a_model_that_takes_too_much_is_given_up(directory, xml, seconds, reason):
-    """Time or memory; this process goes on."""
+def test_compiling_stops_at_its_limits(directory, xml, seconds, reason):
+    """The compiler exceeds time or memory; this process goes on."""
     path = FILES["zip"][1](directory)
-    put_zip({MAIN: xml.encode()}, path)
+    write_zip({MAIN: xml.encode()}, path)
     with pytest.raises(UnreadableFile, match=reason):
         compile_sources(path, compiled_size=1, seconds=seconds)

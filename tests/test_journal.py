@@ -1,42 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal keeps every completed episode, whatever happens to the process."""
+"""The journal keeps every completed episode."""
 
-import dataclasses
 import json
 import math
 import re
 
 import pytest
 from full_disk import file_size_limit
+from result_files import entry, write_journal
 
 from mjrec.errors import ClosedError, FileNotWritten
-from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
+from mjrec.formats.journal import JournalWriter, read_journal
 
-ENTRY = JournalEntry(
-    *(3, 200, 1.5, "e", 90.25, 91.5, 7, {"x": [1, 2]}),
-    terminated=False,
-    truncated=True,
-    success=None,
-    chosen=True,
-    recording="live",
-)
-NEXT = dataclasses.replace(ENTRY, episode_id=4, seed=None, options=None)
+INFIX = "0.1"
+FACTS = {"type": "e", "options": {"x": [1, 2]}, "chosen": True, "recording": "live"}
+ENTRY, NEXT = entry(3, **FACTS), entry(4, **{**FACTS, "options": None, "seed": None})
 
 
 @pytest.fixture
 def path(tmp_path):
-    return tmp_path / "openaigym.episodes.0.1.jsonl"
+    return tmp_path / f"openaigym.episodes.{INFIX}.jsonl"
 
 
-def write(path, *entries, **options):
-    writer = JournalWriter(path, **options)
-    for entry in entries:
-        writer.append(entry)
-    writer.close()
-
-
-def changed(**facts):
-    return dataclasses.replace(ENTRY, **facts)
+def write(path, *entries):
+    write_journal(path.parent, INFIX, *entries)
 
 
 def read(path):
@@ -50,33 +37,32 @@ def read(path):
         *({"reward": reward} for reward in (math.inf, -math.inf, math.nan)),
     ],
 )
-def test_entries_come_back_as_they_were(path, facts):
-    """Each as `append` returns, with what JSON has no number for; then it is closed."""
-    writer = JournalWriter(path)
+def test_entries_are_read_back(path, facts):
+    writer, first = JournalWriter(path), entry(3, **{**FACTS, **facts})
     assert not path.exists()
-    writer.append(changed(**facts))
-    assert repr(read(path)) == repr([changed(**facts)])
+    writer.append(first)
+    assert repr(read(path)) == repr([first])
     writer.append(NEXT)
     writer.close()
     with pytest.raises(ClosedError, match="jsonl"):
         writer.append(NEXT)
-    # NaN is equal to nothing; its text is.
-    assert repr(read(path)) == repr([changed(**facts), NEXT])
+    # The text of NaN equals itself.
+    assert repr(read(path)) == repr([first, NEXT])
     assert not re.search("NaN|Infinity", path.read_text())
 
 
-def test_options_of_any_type_and_size_do_not_stop_a_run(path):
-    """They are written as their repr, and cut off."""
-    write(path, changed(options={"lock": re}), changed(options="x" * (1 << 24)))
+def test_options_of_any_type_and_size_are_written(path):
+    """The journal has their repr, cut to a limit."""
+    write(path, entry(3, options={"lock": re}), entry(3, options="x" * (1 << 24)))
     first, second = (json.loads(line) for line in path.read_text().splitlines())
     assert "module 're'" in first["options"]["lock"]["repr"]
     assert second["options"]["repr"].startswith("'xx")
     assert path.stat().st_size < 4000
 
 
-def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
-    """At each byte; one warning, its number is still known, and writing goes on."""
-    later = changed(episode_id=5)
+def test_cut_last_line_is_left_out(path, caplog):
+    """One warning names its number if it is known; writing goes on."""
+    later = entry(5)
     write(path, ENTRY, NEXT)
     whole = path.read_bytes()
     first, second = whole.splitlines(keepends=True)
@@ -84,10 +70,10 @@ def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
         path.write_bytes(first + second[:kept])
         caplog.clear()
         assert read(path) == [ENTRY]
-        [said] = caplog.messages
-        assert f"{path}: skipped 1 line: line 2" in said
-        assert "cut off" in said
-    assert "line 2 (episode 4)" in said
+        [warning] = caplog.messages
+        assert f"{path}: skipped 1 line: line 2" in warning
+        assert "cut off" in warning
+    assert "line 2 (episode 4)" in warning
     numbers = []
     assert list(read_journal(path, on_damage=numbers.append)) == [ENTRY]
     assert numbers == [4]
@@ -106,20 +92,18 @@ def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
     ],
 )
 def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
-    """The episodes before and after it are read; the warning says where and what."""
-    late = changed(episode_id=10**14)
-    write(path, late, NEXT, changed(reward=9.0, episode_id=4), ENTRY, late)
+    late = entry(10**14, length=10, start_time=99.5, end_time=100.0)
+    write(path, late, NEXT, entry(4, reward=9.0), ENTRY, late)
     first, *rest = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + damage + b"".join(rest))
-    # Of two lines with one number the first is read, in any order of numbers.
+    # The first of two lines with one number counts, in any order of numbers.
     assert read(path) == [late, NEXT, ENTRY]
-    [said] = caplog.messages
-    assert f"{path}: skipped 3 lines: the first is line 2" in said
-    assert reason in said
+    [warning] = caplog.messages
+    assert f"{path}: skipped 3 lines: the first is line 2" in warning
+    assert reason in warning
 
 
-def test_what_is_no_journal_is_given_up_on(path, caplog):
-    """After a thousand damaged lines, or one without end; memory stays small."""
+def test_reading_stops_at_a_thousand_damaged_lines(path, caplog):
     write(path, ENTRY)
     line = path.read_bytes()
     path.write_bytes(b"\n" * 999 + line)
@@ -135,11 +119,10 @@ def test_what_is_no_journal_is_given_up_on(path, caplog):
     assert "too long" in caplog.text
 
 
-def test_a_line_that_does_not_fit_is_taken_back(path):
-    """It comes before the next one; half a line left by Ctrl-C goes then."""
+def test_failed_line_is_written_before_the_next_one(path):
     writer = JournalWriter(path)
     writer.append(ENTRY)
-    # As on a full disk, the first part of the line is written, and then no more.
+    # A full disk takes only the first part of the line.
     with (
         file_size_limit(path.stat().st_size + 10),
         pytest.raises(FileNotWritten, match="space"),
@@ -148,10 +131,10 @@ def test_a_line_that_does_not_fit_is_taken_back(path):
     assert len(path.read_bytes().splitlines()) == 1
     with path.open("ab") as file:
         file.write(b'{"episode_id": 4, "le')
-    third = dataclasses.replace(NEXT, episode_id=NEXT.episode_id + 1)
+    third = entry(5)
     writer.append(third)
     assert read(path) == [ENTRY, NEXT, third]
-    # One that is removed is noticed, and the entry after that begins another.
+    # A removed journal is an error; the next entry begins another.
     path.unlink()
     with pytest.raises(FileNotWritten, match="removed while being written"):
         writer.append(ENTRY)

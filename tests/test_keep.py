@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors that decide after the episodes which of them get a video."""
+"""`keep=` chooses afterwards which episodes get a video."""
 
 import contextlib
 import logging
@@ -18,12 +18,11 @@ import mjrec
 from mjrec.formats import video_sink
 from mjrec.recorder.tracking import Tracker
 
-# Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
 
 
-class Limited(gymnasium.Wrapper):
-    """Ends an episode after as many steps as its return is to be."""
+class ChosenReturns(gymnasium.Wrapper):
+    """Ends each episode when its return is reached, at 1.0 a step."""
 
     def __init__(self, env, returns, success=()):
         super().__init__(env)
@@ -43,57 +42,55 @@ class Limited(gymnasium.Wrapper):
 
 
 def pendulum(returns=RETURNS, **arguments):
-    """Return a small environment."""
     size = {"width": 64, "height": 64, "render_mode": "rgb_array"}
-    return Limited(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
+    env = gymnasium.make("InvertedPendulum-v5", **size)
+    return ChosenReturns(env, returns, **arguments)
 
 
 def finish_episode(env):
-    """Take steps to the end of an episode."""
     while not any(env.step(env.action_space.sample())[2:4]):
         pass
 
 
 def run(env, episodes):
-    """Run whole episodes."""
     for _ in range(episodes):
         env.reset(seed=0)
         finish_episode(env)
 
 
 def numbers(paths):
-    """Return the numbers of the episodes that paths are of."""
+    """Return the episode numbers in file names."""
     return sorted(int(path.stem[-6:]) for path in paths)
 
 
-def decided(directory):
-    """Return which episodes were recorded, and what is said of the choice."""
+def choice_in(directory):
+    """Return the recorded episodes, whether the choice was made, and the choice."""
     details = manifest_of(directory)["mjrec"]
     keep = details["keep"]
     return details["schedule"]["recorded"], keep["decided"], keep["chosen"]
 
 
-both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
+live_and_deferred = pytest.mark.parametrize("mode", ["live", "deferred"])
 
 
-@both_ways
-def test_the_worst_n_are_kept(tmp_path, way):
-    """Never more candidates than N; only the chosen are drawn, named, notified."""
+@live_and_deferred
+def test_worst_n_are_kept(tmp_path, mode):
+    """There are never more than N candidates; trackers see only chosen videos."""
     notified = {}
     tracker = Tracker()
     tracker.video = lambda _, video: notified.update(
         {video.episode_id: (video.episode.length, video.path.exists())}
     )
-    options = {"workers": 1, "trackers": tracker, "name_prefix": "w", "render": way}
+    options = {"workers": 1, "trackers": tracker, "name_prefix": "w", "render": mode}
     with mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", **options) as monitor:
         for number in range(8):
             monitor.reset(seed=0)
-            # The candidates' logs, and that of the running episode.
+            # Two candidates and the running episode.
             assert len(list(tmp_path.glob("*.log"))) <= 3
             finish_episode(monitor)
             so_far = sorted(range(number + 1), key=lambda k: (RETURNS[k], k))[:2]
             assert numbers(in_flight(tmp_path)) == sorted(so_far)
-            assert videos_in(tmp_path) == (sorted(so_far) if way == "live" else [])
+            assert videos_in(tmp_path) == (sorted(so_far) if mode == "live" else [])
         assert not list(tmp_path.glob("w-*"))
         assert notified == {}
     assert videos_in(tmp_path) == numbers(tmp_path.glob("*.h5")) == [1, 3]
@@ -116,12 +113,12 @@ def test_the_worst_n_are_kept(tmp_path, way):
     assert len(mjrec.load_results(tmp_path)["episode_lengths"]) == 8
 
 
-@both_ways
-def test_failures_are_what_the_environment_calls_so(tmp_path, way):
-    """Drawn at the end of each; after N no frame is recorded any more."""
-    made = pendulum(success=[True, False, True, False, False, True, False, False])
-    options = {"keep": "failures:2", "render": way, "workers": 1}
-    with mjrec.Monitor(made, tmp_path, **options) as env:
+@live_and_deferred
+def test_first_n_failures_are_kept(tmp_path, mode):
+    """Each is drawn when it ends; after N, recording stops."""
+    pole = pendulum(success=[True, False, True, False, False, True, False, False])
+    options = {"keep": "failures:2", "render": mode, "workers": 1}
+    with mjrec.Monitor(pole, tmp_path, **options) as env:
         run(env, 3)
         wait_until(lambda: videos_in(tmp_path) == [1])
         run(env, 5)
@@ -129,7 +126,7 @@ def test_failures_are_what_the_environment_calls_so(tmp_path, way):
     assert videos_in(tmp_path) == [1, 3]
     selection = {"rule": "failures:2", "decided": True, "finished": 2}
     assert metadata_of(tmp_path, 1)["selection"] == selection
-    assert decided(tmp_path) == ([1, 3], True, [1, 3])
+    assert choice_in(tmp_path) == ([1, 3], True, [1, 3])
 
 
 def longest(episodes):
@@ -137,17 +134,18 @@ def longest(episodes):
 
 
 @pytest.mark.parametrize(
-    # 1 2 2 3 4 4 5 6: the lower middle is episode 6.
-    ("keep", "way", "kept"),
+    ("keep", "mode", "kept"),
     [("median", "deferred", [6]), (longest, "live", [0, 7])],
 )
-def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog):
-    """It says so once; the rule or the function's name stands in the manifest."""
+def test_rules_over_all_episodes_keep_all_until_close(
+    keep, mode, kept, tmp_path, caplog
+):
+    """One message says so; the manifest names the rule or function."""
     caplog.set_level(logging.INFO, "mjrec")
-    with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
+    with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=mode, workers=1) as env:
         run(env, 8)
         assert [*range(8)] == (
-            numbers(in_flight(tmp_path)) if way == "deferred" else videos_in(tmp_path)
+            numbers(in_flight(tmp_path)) if mode == "deferred" else videos_in(tmp_path)
         )
     assert caplog.text.count("kept on disk") == 1
     assert videos_in(tmp_path) == kept
@@ -158,13 +156,13 @@ def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog)
 @pytest.mark.parametrize(
     ("options", "kept"),
     [
-        # In evaluation every trajectory stays; else `trajectory_callable` decides.
+        # Evaluation keeps every trajectory; otherwise `trajectory_callable` decides.
         ({"mode": "evaluation", "workers": 0}, [0, 1, 2, 3]),
         ({"trajectory_callable": lambda episode: episode == 1, "workers": 1}, [1]),
     ],
 )
-def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
-    """Whatever becomes of the videos; those that fell out promise none."""
+def test_trajectories_are_kept_apart_from_videos(tmp_path, options, kept):
+    """An episode that lost its place promises no video."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
     assert numbers(tmp_path.glob("*.h5")) == kept
@@ -178,10 +176,10 @@ def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
     assert metadata_of(tmp_path, 2)["selection"]["rule"] == "best:1"
 
 
-@both_ways
-def test_incomplete_episodes_are_never_chosen(tmp_path, way):
-    """Neither one that was reset nor the one that was closed; nothing of them stays."""
-    options = {"render": way, "allow_early_reset": True, "workers": 1}
+@live_and_deferred
+def test_incomplete_episodes_are_never_chosen(tmp_path, mode):
+    """Whether ended by reset or by close, they leave no files."""
+    options = {"render": mode, "allow_early_reset": True, "workers": 1}
     with mjrec.Monitor(pendulum(), tmp_path, keep="worst:3", **options) as monitor:
         run(monitor, 1)
         for _ in range(2):
@@ -189,7 +187,7 @@ def test_incomplete_episodes_are_never_chosen(tmp_path, way):
             monitor.step(monitor.action_space.sample())
     assert videos_in(tmp_path) == [0]
     assert not [*tmp_path.glob(".*"), *tmp_path.glob("*00000[12]*")]
-    assert decided(tmp_path)[2] == [0]
+    assert choice_in(tmp_path)[2] == [0]
 
 
 def confused(episodes):
@@ -197,22 +195,22 @@ def confused(episodes):
 
 
 @parametrize(
-    ("way", "options"),
+    ("mode", "options"),
     [("live", {}), ("deferred", {"wait": True}), ("deferred", {"wait": False})],
     default=2,
 )
-def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
-    """One error names it; all is closed, and all videos are there or pending."""
-    env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=way)
+def test_invalid_choice_loses_nothing(tmp_path, mode, options):
+    """One error names the function; all videos are there or pending."""
+    env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=mode)
     run(env, 3)
     with pytest.raises(mjrec.InvalidArgument, match=r"confused returned 3, .* 0, 1, 2"):
         env.close(**options)
     env.close()
     assert not list(tmp_path.glob(".*"))
-    assert decided(tmp_path) == ([0, 1, 2], False, [])
+    assert choice_in(tmp_path) == ([0, 1, 2], False, [])
     details = manifest_of(tmp_path)["mjrec"]
     assert "returned 3" in details["keep"]["failure"]
-    assert len(details["pending"]) == (3 if way == "deferred" else 0)
+    assert len(details["pending"]) == (3 if mode == "deferred" else 0)
     mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [0, 1, 2]
     assert len(manifest_of(tmp_path)["videos"]) == 3
@@ -221,20 +219,20 @@ def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
 
 
 @parametrize("on_error", ["warn", "raise"])
-def test_a_full_disk_at_the_end_loses_no_chosen_video(tmp_path, on_error):
-    """What the journal has no room for waits; it is pending all the same."""
+def test_full_disk_at_close_loses_no_chosen_video(tmp_path, on_error):
+    """The chosen videos are pending."""
     options = {"keep": "worst:2", "workers": 0, "on_error": on_error}
     env = mjrec.Monitor(pendulum(), tmp_path, **options)
     run(env, 8)
     [journal] = tmp_path.glob("*.jsonl")
-    raised = pytest.raises(mjrec.FileNotWritten)
+    error = pytest.raises(mjrec.FileNotWritten)
     with (
         file_size_limit(journal.stat().st_size + 20),
-        raised if on_error == "raise" else contextlib.nullcontext(),
+        error if on_error == "raise" else contextlib.nullcontext(),
     ):
         env._recorder.finish()
     env.close()
-    assert decided(tmp_path)[0] == [1, 3]
+    assert choice_in(tmp_path)[0] == [1, 3]
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
     assert not list(tmp_path.glob("*episode00000[024567]*"))
     mjrec.render_videos(tmp_path, workers=1)
@@ -242,8 +240,8 @@ def test_a_full_disk_at_the_end_loses_no_chosen_video(tmp_path, on_error):
 
 
 @pytest.mark.parametrize(("returns", "kept"), [([2, 4], 0), ([4, 2], 1)])
-def test_a_full_disk_at_the_metadata_of_a_live_candidate(returns, kept, tmp_path):
-    """It is written at the end with the choice, or nothing of the video is left."""
+def test_full_disk_at_metadata_of_a_live_candidate(returns, kept, tmp_path):
+    """Its metadata is written when it is chosen; otherwise its files go."""
 
     def full(video, metadata):
         raise mjrec.FileNotWritten(video, "No space left on device")
@@ -277,25 +275,25 @@ os.kill(os.getpid(), 9)
 
 
 @parametrize(
-    ("kind", "recovers"),
+    ("mode", "recovers"),
     [("deferred", True), ("live", True), ("deferred", False)],
     default=2,
 )
-def test_a_killed_run_leaves_its_candidates(tmp_path, kind, recovers):
-    """And the running episode, and nothing of what had fallen out; undecided."""
+def test_killed_run_leaves_candidates_and_running_episode(tmp_path, mode, recovers):
+    """No choice was made; other episodes leave no files."""
     here = Path(__file__).parent
-    run_python(PROGRAM, tmp_path, kind, here, status=-signal.SIGKILL)
+    run_python(PROGRAM, tmp_path, mode, here, status=-signal.SIGKILL)
     assert numbers(in_flight(tmp_path)) == [1, 3, 5]
     if recovers:
         mjrec.recover(tmp_path)
         details = manifest_of(tmp_path)["mjrec"]
         assert details["schedule"]["name"] == "keep:worst:2"
         assert details["keep"]["rule"] == "worst:2"
-        assert decided(tmp_path)[1:] == (False, [])
-        assert len(details["pending"]) == (0 if kind == "live" else 3)
+        assert choice_in(tmp_path)[1:] == (False, [])
+        assert len(details["pending"]) == (0 if mode == "live" else 3)
     mjrec.render_videos(tmp_path, workers=1)
     assert set(videos_in(tmp_path)) - {5} == {1, 3}
-    assert kind == "live" or videos_in(tmp_path) == [1, 3, 5]
+    assert mode == "live" or videos_in(tmp_path) == [1, 3, 5]
     selection = {"rule": "worst:2", "decided": False}
     assert metadata_of(tmp_path, 1)["selection"] == selection
     listed = {name[-10:-4] for name, _ in manifest_of(tmp_path)["videos"]}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A lock is held exactly as long as its process lives or until it is released."""
+"""A lock is held until it is released or its process dies."""
 
 import os
 import subprocess
@@ -16,12 +16,12 @@ from mjrec.formats.locks import Lock, try_lock, wait_for_lock
 path = pathlib.Path(sys.argv[1])
 """
 WAIT = 'print("held", flush=True)\nsys.stdin.read()\n'
-# A program and a forked child that outlive the process that holds the lock.
-LEFT = {
+# A program and a forked child that outlive the holder of the lock.
+SURVIVORS = {
     "exec": 'subprocess.Popen(["cat"], stdout=subprocess.DEVNULL, close_fds=False)\n',
     "fork": "if os.fork(): sys.stdin.read()\nlock.release()\n",
 }
-# Adds one under the lock, which is removed and made again all the while.
+# Each release removes the lock's file.
 COUNT = """
 number = path.with_name("number")
 for _ in range(300):
@@ -38,7 +38,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def start(path):
-    """Run code in a process that has the lock's `path`."""
+    """Return a function that runs code in a process with the lock's `path`."""
     started = []
 
     def run(code):
@@ -54,8 +54,7 @@ def start(path):
         process.communicate()
 
 
-def test_a_lock_is_held_until_it_is_released(path):
-    """Release removes the file, and leaves one that another has put there."""
+def test_release_removes_only_its_own_file(path):
     first = Lock(path, "who holds it")
     assert is_locked(path)
     with pytest.raises(FileExistsError):
@@ -70,27 +69,26 @@ def test_a_lock_is_held_until_it_is_released(path):
 
 
 @pytest.mark.parametrize("way", ["Lock", "try_lock"])
-@pytest.mark.parametrize("left", LEFT)
-def test_a_killed_process_holds_no_lock(path, left, way, start):
-    """Whatever it leaves behind; the file is taken over, with what it says."""
+@pytest.mark.parametrize("survivor", SURVIVORS)
+def test_killed_process_holds_no_lock(path, survivor, way, start):
+    """Another process takes over the file, although a child survives."""
     call = 'Lock(path, "content")' if way == "Lock" else "try_lock(path)"
-    holder = start(f"lock = {call}\n{LEFT[left]}{WAIT}")
+    holder = start(f"lock = {call}\n{SURVIVORS[survivor]}{WAIT}")
     assert holder.stdout.readline() == "held\n"
     assert is_locked(path)
     assert try_lock(path) is None
     holder.kill()
     holder.wait()
     assert not is_locked(path)
-    said = path.read_text()
+    content = path.read_text()
     lock = try_lock(path)
     assert is_locked(path)
-    assert path.read_text() == said
+    assert path.read_text() == content
     lock.release()
     assert not path.exists()
 
 
-def test_one_process_at_a_time_has_a_lock(path, start):
-    """Though each removes the file that the others wait for."""
+def test_lock_is_exclusive_between_processes(path, start):
     number = path.with_name("number")
     number.write_text("0")
     assert [each.wait() for each in [start(COUNT) for _ in range(3)]] == [0, 0, 0]
@@ -99,8 +97,7 @@ def test_one_process_at_a_time_has_a_lock(path, start):
 
 @pytest.mark.parametrize("get", [try_lock, wait_for_lock])
 @pytest.mark.parametrize("put", [os.symlink, os.link, lambda _, path: os.mkfifo(path)])
-def test_no_other_file_is_taken_for_a_lock(put, get, path):
-    """Neither through a link nor by its second name; a pipe is not waited for."""
+def test_links_and_pipes_are_no_locks(put, get, path):
     victim = path.with_name("victim")
     victim.write_text("valuable")
     put(victim, path)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a model and a view has changed: everything that has, and nothing else."""
+"""Changes to a model or view are noticed, and only changes."""
+
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,29 +17,11 @@ from mjrec.simulation.fields import (
 from mjrec.simulation.looks import Looks
 from mjrec.simulation.view import SceneView
 
-# With a texture, a mesh and a height field.
-RICH = """
-<mujoco>
-  <asset>
-    <texture name="t" type="2d" builtin="checker" width="64" height="64"/>
-    <material name="a" texture="t"/>
-    <hfield name="h" nrow="40" ncol="40" size="1 1 1 1"/>
-    <mesh name="m" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>
-  </asset>
-  <worldbody>
-    <light/>
-    <geom type="plane" size="1 1 1" material="a"/>
-    <geom type="hfield" hfield="h"/>
-    <camera name="c"/>
-    <body name="b"><freejoint/><geom size=".1"/><site name="s"/></body>
-  </worldbody>
-</mujoco>
-"""
-
 
 @pytest.fixture
 def model():
-    return mujoco.MjModel.from_xml_string(RICH)
+    path = Path(__file__).parents[1] / "assets/showcase.xml"
+    return mujoco.MjModel.from_xml_path(str(path))
 
 
 def view():
@@ -47,7 +31,7 @@ def view():
 
 
 def change(struct, name):
-    """Set a field, or the last number of one, to another value."""
+    """Change a field, or the last byte of an array."""
     holder, last = holder_of(struct, name)
     value = getattr(holder, last)
     if isinstance(value, np.ndarray):
@@ -56,8 +40,8 @@ def change(struct, name):
         setattr(holder, last, value + 1)
 
 
-def test_a_change_of_any_field_is_noticed(model):
-    """Every array with elements, every member of `opt`, `vis` and `stat`: by name."""
+def test_change_of_any_field_is_noticed_by_name(model):
+    """Fields are arrays and members of `opt`, `vis` and `stat`."""
     looks = Looks(model)
     looks.follow(view())
     arrays = [name for name in array_names() if getattr(model, name).size]
@@ -77,11 +61,10 @@ def test_a_change_of_any_field_is_noticed(model):
 
 
 @pytest.mark.parametrize("which", ["camera", "option"])
-def test_every_member_of_a_view_is_watched(model, which):
-    """One change, one name, once."""
-    looks, shown = Looks(model), view()
-    looks.follow(shown)
-    struct = getattr(shown, which)
+def test_change_of_any_view_member_is_noticed_once(model, which):
+    looks, watched = Looks(model), view()
+    looks.follow(watched)
+    struct = getattr(watched, which)
     for name in member_names(struct):
         change(struct, name)
         changed = looks.changed() or {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the kernel says a process may use, read from small file trees."""
+"""Resources of a process, read from small trees of kernel files."""
 
 import os
 
@@ -12,20 +12,19 @@ from mjrec.machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
     ("own", "quotas", "expected"),
     [
         ("0::/\n", {"": "250000 100000"}, 2.5),
-        # The least quota on the way up counts.
+        # The lowest quota of all parents counts.
         (
             "0::/a/b/c\n",
             {"a": "100000 100000", "a/b": "400000 100000", "a/b/c": "max 100000"},
             1.0,
         ),
-        # No limit is said, or none is to be found.
+        # No limit.
         ("0::/\n", {"": "max 100000"}, None),
         ("0::/\n", {}, None),
         ("1:cpu:/\n", {"": "100000 100000"}, None),
     ],
 )
-def test_cpus_that_the_cgroup_grants(own, quotas, expected, tmp_path):
-    """None where nothing limits them."""
+def test_cgroup_limits_cpus(own, quotas, expected, tmp_path):
     root = tmp_path / "cgroup"
     for group, quota in quotas.items():
         (root / group).mkdir(parents=True, exist_ok=True)
@@ -35,7 +34,6 @@ def test_cpus_that_the_cgroup_grants(own, quotas, expected, tmp_path):
 
 
 def test_usable_cpus_follow_the_affinity():
-    """A process that is bound to one CPU has one."""
     before = os.sched_getaffinity(0)
     assert 1 <= usable_cpus() <= len(before)
     os.sched_setaffinity(0, {min(before)})
@@ -45,8 +43,7 @@ def test_usable_cpus_follow_the_affinity():
         os.sched_setaffinity(0, before)
 
 
-def test_gpus(tmp_path):
-    """NVIDIA's devices and everybody's render nodes; nothing else."""
+def test_gpus_are_nvidia_devices_and_render_nodes(tmp_path):
     (tmp_path / "dri").mkdir()
     for name in ("nvidia0", "nvidiactl", "dri/renderD128", "dri/card0", "null"):
         (tmp_path / name).touch()

@@ -18,8 +18,7 @@ EPISODES = 3
 STEPS = 4
 
 
-def test_eight_threads(tmp_path, make_corridor):
-    """Each with a monitor of its own, and an encoder at work in each."""
+def test_eight_threads_record_into_one_directory(tmp_path, make_corridor):
     barrier = threading.Barrier(WRITERS)
 
     def record(_):
@@ -30,7 +29,6 @@ def test_eight_threads(tmp_path, make_corridor):
 
     with ThreadPoolExecutor(WRITERS) as threads:
         list(threads.map(record, range(WRITERS)))
-    # There is everything of everyone, and nothing twice.
     infixes = {path.name.split(".")[2] for path in tmp_path.glob("*.jsonl")}
     assert len(infixes) == len(list(tmp_path.glob("*.manifest.json"))) == WRITERS
     lengths = mjrec.load_results(tmp_path)["episode_lengths"]
@@ -42,8 +40,7 @@ def test_eight_threads(tmp_path, make_corridor):
 
 
 @pytest.mark.parametrize("send", [pickle.dumps, copy.copy, copy.deepcopy])
-def test_a_monitor_is_not_sent_to_another_process(send, tmp_path, corridor):
-    """The error says where to make it instead."""
+def test_monitor_cannot_be_pickled_or_copied(send, tmp_path, corridor):
     with Monitor(corridor, tmp_path, video_callable=False) as monitor:
         with pytest.raises(NotPicklable, match="inside the function") as caught:
             send(monitor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MJCF files, simulated and as an environment."""
+"""MJCF files as environments."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from mjrec.environments.mjcf_environments import MjcfEnvironment, make_mjcf
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.simulation.mjcf import load_mjcf
 
-# A red ball on a rail with a motor, a free one, and a green one far from both.
+# A red ball on a rail with a motor, and a green one far away.
 MODEL = """
 <mujoco>
   <option timestep="{timestep}"/>
@@ -39,8 +39,8 @@ FOLLOWER = '<camera name="follow" mode="trackcom" pos="0 -2 0" xyaxes="1 0 0 0 0
 def write(tmp_path):
     def write_model(**values):
         path = tmp_path / "my rail (2).xml"
-        usual = {"timestep": 0.002, "cameras": "", "follower": "", "gear": 5}
-        path.write_text(MODEL.format(**{**usual, **values}))
+        defaults = {"timestep": 0.002, "cameras": "", "follower": "", "gear": 5}
+        path.write_text(MODEL.format(**{**defaults, **values}))
         return path
 
     return write_model
@@ -49,11 +49,8 @@ def write(tmp_path):
 @pytest.mark.parametrize(
     ("timestep", "fps"), [(0.0033, 60), (0.0166667, 60), (0.025, 40)]
 )
-def test_there_are_sixty_frames_to_the_second(write, timestep, fps):
-    """No frame is more than half a timestep off, and nothing adds up; each episode.
-
-    A simulation slower than 60 steps a second plays at its own rate.
-    """
+def test_sixty_frames_a_second(write, timestep, fps):
+    """Frame times drift at most half a timestep; slower simulations keep their rate."""
     env = MjcfEnvironment(write(timestep=timestep))
     assert env.metadata["render_fps"] == fps
     assert env.control_timestep() == pytest.approx(1 / fps)
@@ -61,15 +58,15 @@ def test_there_are_sixty_frames_to_the_second(write, timestep, fps):
         env.reset()
         for frame in range(1, 301):
             env.step(np.zeros(2))
-            # A hundred-thousandth is the rounding of 1/60 and 1/240 to these digits.
-            off = abs(env.simulation.data.time - frame / fps)
-            assert off <= timestep / 2 + 1e-5 * frame / fps
+            drift = abs(env.simulation.data.time - frame / fps)
+            # 1e-5 is the rounding of these timesteps.
+            assert drift <= timestep / 2 + 1e-5 * frame / fps
 
 
-# States have no bounds, and the actuators' ranges are the author's.
+# States have no bounds, and the author chose the actuators' ranges.
 @pytest.mark.filterwarnings("ignore:.*Box (action|observation) space:UserWarning")
-def test_the_environment_keeps_gymnasiums_contract(write):
-    """Actions are the controls in their ranges, observations positions and speeds."""
+def test_environment_passes_check_env(write):
+    """Actions are controls; observations are positions and velocities."""
     check_env(MjcfEnvironment(write()), skip_render_check=True)
     env = MjcfEnvironment(write())
     space = env.action_space
@@ -83,8 +80,7 @@ def test_the_environment_keeps_gymnasiums_contract(write):
     assert rest == [0.0, False, False, {}]
 
 
-def test_a_model_without_actuators_is_simulated(tmp_path):
-    """A passive model takes empty actions."""
+def test_model_without_actuators_takes_empty_actions(tmp_path):
     path = tmp_path / "falling.mjcf"
     body = '<body><freejoint/><geom size=".1"/></body>'
     path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
@@ -94,36 +90,32 @@ def test_a_model_without_actuators_is_simulated(tmp_path):
     assert env.step(env.action_space.sample())[0][2] < 0
 
 
-def test_an_unstable_simulation_ends_where_it_was_sound(write, tmp_path, monkeypatch):
-    """MuJoCo starts over by itself; the episode must not go on from there."""
-    # MuJoCo writes MUJOCO_LOG.TXT where it is.
-    monkeypatch.chdir(tmp_path)
+def test_unstable_simulation_terminates_at_its_last_state(write, tmp_path, monkeypatch):
+    """MuJoCo resets by itself; the episode must not continue."""
+    monkeypatch.chdir(tmp_path)  # for MUJOCO_LOG.TXT
     env = MjcfEnvironment(write(gear=1e12))
     env.reset()
-    sound, *_ = env.step(np.zeros(2))
+    last, *_ = env.step(np.zeros(2))
     time = env.simulation.data.time
     observation, _, terminated, truncated, info = env.step(np.array([1.0, 0.0]))
     assert (terminated, truncated) == (True, False)
     assert "unstable" in info["unstable"]
-    assert observation.tolist() == sound.tolist()
+    assert observation.tolist() == last.tolist()
     assert env.simulation.data.time == time > 0
     env.reset()
     assert env.step(np.zeros(2))[2] is False
 
 
 @pytest.mark.parametrize("action", [[0.0], [0, np.nan], np.zeros((2, 1))])
-def test_what_is_no_control_is_refused(write, action):
-    """MuJoCo would go on with other controls, or raise something obscure."""
+def test_invalid_action_is_refused(write, action):
     env = MjcfEnvironment(write())
     env.reset()
-    with pytest.raises(
-        mjrec.InvalidArgument, match=r"finite numbers with the shape \(2,\)"
-    ):
+    reason = r"finite numbers with the shape \(2,\)"
+    with pytest.raises(mjrec.InvalidArgument, match=reason):
         env.step(action)
 
 
-def test_frames_follow_from_states(write):
-    """Wrapped or not, unless something overrides; a model has no end of its own."""
+def test_mjcf_environment_is_recorded_from_states(write):
     path = write(cameras=FIXED)
     scenes = gymnasium_scenes(make_mjcf(path, EnvironmentOptions()))
     assert scenes.obstacle is None
@@ -140,8 +132,7 @@ def test_frames_follow_from_states(write):
     assert "overrides render()" in gymnasium_scenes(limited).obstacle
 
 
-def test_frames_show_the_camera_that_follows_or_the_first(write):
-    """The ball stays in the middle of the frame however far it goes."""
+def test_default_camera_follows_or_is_the_first(write):
     size = {"render_mode": "rgb_array", "height": 32, "width": 48}
     env = MjcfEnvironment(write(cameras=FIXED, follower=FOLLOWER), **size)
     assert env.camera == "follow"
@@ -149,7 +140,7 @@ def test_frames_show_the_camera_that_follows_or_the_first(write):
     for _ in range(60):
         env.step(np.array([3, 0]))
     assert env.simulation.data.qpos[0] > 1
-    frame = env.render()
+    frame = env.render()  # with the ball in the middle
     assert frame.shape == (32, 48, 3)
     assert frame[16, 24, 0] > 100 > frame[16, 24, 1]
     env.close()
@@ -163,7 +154,6 @@ def test_frames_show_the_camera_that_follows_or_the_first(write):
 
 
 def test_wrong_arguments_are_refused_at_once(write):
-    """A camera that is not there, a window, and more than a file can take."""
     path = write(cameras=FIXED)
     with pytest.raises(mjrec.UnknownName, match=r"'nose'.*fixed"):
         MjcfEnvironment(path, camera="nose")
@@ -185,8 +175,7 @@ def test_wrong_arguments_are_refused_at_once(write):
         ('<mujoco><asset><mesh file="nowhere.stl"/></asset></mujoco>', "nowhere.stl"),
     ],
 )
-def test_a_bad_file_gives_mujocos_reason_and_its_own_name(tmp_path, text, reason):
-    """One sentence: which file, and what MuJoCo says is wrong in it."""
+def test_invalid_file_is_an_error_with_name_and_reason(tmp_path, text, reason):
     path = tmp_path / "bad.xml"
     path.write_text(text)
     with pytest.raises(mjrec.UnreadableFile, match=f"bad.xml: .*{reason}") as caught:

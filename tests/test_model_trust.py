@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A compiled model is loaded if this user has stored it, or says so."""
+"""Compiled models load only if this user stored them or trusts them."""
 
 import gzip
 import hashlib
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from full_disk import file_size_limit
 from rides import record
-from sound_files import stored
+from sound_files import store_model
 
 import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
@@ -40,8 +40,8 @@ BY_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files aw
 
 
 @pytest.fixture(autouse=True)
-def listed(tmp_path, monkeypatch):
-    """A user with a home, and a temporary directory for this test; return the list."""
+def trust_list(tmp_path, monkeypatch):
+    """Give this test its own home and temporary directory; return the trust list."""
     temporary = tmp_path / "tmp"
     temporary.mkdir(mode=0o1777)
     monkeypatch.setenv("TMPDIR", str(temporary))
@@ -53,7 +53,7 @@ def listed(tmp_path, monkeypatch):
 
 @pytest.fixture
 def fallback(tmp_path):
-    """Where the list is while the home cannot be written."""
+    """The list's path while the home directory is not writable."""
     return tmp_path / f"tmp/mjrec-{os.geteuid()}/models"
 
 
@@ -79,29 +79,25 @@ def digest_of(content):
     return hashlib.sha256(str(content).encode()).hexdigest()
 
 
-# --- the list ------------------------------------------------------------------------
-
-
-def test_the_list_is_the_users_alone(listed, become_another_user):
-    """Made with the first model, not by looking; each model is in it once, in order."""
+def test_trust_list_is_private_to_its_user(trust_list, become_another_user):
+    """The first model makes it; each model is in it once, in order."""
     assert not is_stored(DIGEST)
     note_models([])
-    assert not listed.parent.exists()
+    assert not trust_list.parent.exists()
     note_models([DIGEST])
     note_models([OTHER, DIGEST])
-    assert modes_of(listed) == [0o600, 0o700]
-    assert listed.read_text().split() == [DIGEST, OTHER]
+    assert modes_of(trust_list) == [0o600, 0o700]
+    assert trust_list.read_text().split() == [DIGEST, OTHER]
     assert is_stored(DIGEST)
-    for said in (None, 7, "", DIGEST[:16], f"{DIGEST}\n", "\n", "\udc80"):
-        assert not is_stored(said)
+    for invalid in (None, 7, "", DIGEST[:16], f"{DIGEST}\n", "\n", "\udc80"):
+        assert not is_stored(invalid)
     become_another_user()
     assert not is_stored(DIGEST)
 
 
-def test_many_processes_lose_nothing(listed):
-    """Of each other's lines, and none is torn, also after one that was cut off."""
+def test_concurrent_writers_lose_no_line(trust_list):
     note_models([DIGEST])
-    with listed.open("a") as file:
+    with trust_list.open("a") as file:
         file.write(OTHER[:30])
     program = (
         "import sys; from hashlib import sha256;"
@@ -114,28 +110,28 @@ def test_many_processes_lose_nothing(listed):
     processes = [subprocess.Popen([*command, name]) for name in "abcd"]
     assert [process.wait() for process in processes] == [0] * 4
     expected = {digest_of(f"{name} {n}") for name in "abcd" for n in range(100)}
-    lines = listed.read_text().split()
+    lines = trust_list.read_text().split()
     assert set(lines) == {DIGEST, OTHER[:30], *expected}
     assert len(lines) == 402
     assert not is_stored(OTHER)
 
 
-def test_the_list_does_not_grow_for_ever(listed, monkeypatch):
-    """A task may compile a model for each episode; then the oldest are forgotten."""
+def test_trust_list_forgets_the_oldest_models(trust_list, monkeypatch):
+    """A task may compile a model for each episode."""
     monkeypatch.setattr(model_trust, "_MOST_BYTES", 10 * 66)
     models = list(map(digest_of, range(35)))
     for model in models:
         note_models([model])
-    files = [path.stat().st_size for path in listed.parent.iterdir()]
+    files = [path.stat().st_size for path in trust_list.parent.iterdir()]
     assert sum(files) < 20 * 67
     assert all(map(is_stored, models[-10:]))
     assert not is_stored(models[0])
 
 
-def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
+def test_unwritable_home_uses_the_fallback_list(
     tmp_path, fallback, monkeypatch, caplog
 ):
-    """Nothing is said; and it is still good when there is room at home later."""
+    """There is no warning, and its models stay trusted later."""
     note_models([DIGEST])
     with file_size_limit(70):
         note_models([OTHER])
@@ -145,7 +141,7 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
         patch.setenv("XDG_STATE_HOME", "/dev/null/state")
         note_models([third := digest_of(3)])
     assert all(map(is_stored, [DIGEST, OTHER, third]))
-    # Without variables, as in a cron job, the home is that of the password file.
+    # A cron job has no variables: the password file names the home.
     user = type("User", (), {"pw_dir": str(tmp_path / "home")})
     monkeypatch.setattr("pwd.getpwuid", lambda uid: user)
     monkeypatch.setenv("XDG_STATE_HOME", "relative/is/ignored")
@@ -156,7 +152,7 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "tamper",
     [
         lambda path: path.unlink() or os.mkfifo(path, 0o600),
         lambda path: path.symlink_to(path.rename(path.parent.parent / "elsewhere")),
@@ -165,36 +161,31 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
     ],
     ids=["pipe", "link", "mode", "owner"],
 )
-def test_a_list_that_others_may_have_written_is_not_used(
-    listed, fallback, caplog, spoil
-):
-    """It stays for its owner to decide; a warning says what to do."""
+def test_list_that_others_can_write_is_not_used(trust_list, fallback, caplog, tamper):
+    """The file stays; a warning says what to do."""
     note_models([DIGEST])
-    spoil(listed)
-    left = listed.lstat()
+    tamper(trust_list)
+    before = trust_list.lstat()
     assert not is_stored(DIGEST)
     note_models([OTHER])
     assert is_stored(OTHER)
-    assert listed.lstat().st_ino == left.st_ino
-    [warned] = caplog.messages
-    assert str(listed.parent) in warned or "symbolic links" in warned
-    assert "delete it" in warned
-    # Nor the other place; then there is no list, and a model needs a word.
-    spoil(fallback)
+    assert trust_list.lstat().st_ino == before.st_ino
+    [warning] = caplog.messages
+    assert str(trust_list.parent) in warning or "symbolic links" in warning
+    assert "delete it" in warning
+    # Without any list, models need explicit trust.
+    tamper(fallback)
     note_models([digest_of(3)])
     assert not is_stored(digest_of(3))
     assert f"{TRUST_VARIABLE}=1" in caplog.messages[-1]
 
 
-# --- other machines ------------------------------------------------------------------
-
-
-def test_a_worker_elsewhere_loads_what_its_user_has_stored(
+def test_remote_worker_loads_models_of_its_user(
     directory, tmp_path, become_another_user
 ):
-    """Of the models in the directory, which its worker has reported."""
+    """The job names the stored models of its directory."""
     with noting_models() as noted:
-        facts = {**stored(directory), "xml": None}
+        facts = {**store_model(directory), "xml": None}
     note_models([DIGEST])
     assert noted == [facts["sha256"], directory_digest(directory)]
     sent = stored_models([directory, tmp_path / "not there"])
@@ -208,15 +199,12 @@ def test_a_worker_elsewhere_loads_what_its_user_has_stored(
     assert not is_stored(DIGEST)
 
 
-# --- models --------------------------------------------------------------------------
-
-
 def forbid_compiled_models(patch, directory):
-    """Fail where MuJoCo is given a compiled model of the directory, or its bytes."""
+    """Fail where MuJoCo loads a compiled model of the directory."""
     load = mujoco.MjModel.from_binary_path
 
     def loaded(path, *assets):
-        # The process that compiles sources gives its model in a file elsewhere.
+        # Compiled sources come from a file elsewhere.
         assert not assets
         assert not Path(path).is_relative_to(directory)
         return load(path)
@@ -224,16 +212,16 @@ def forbid_compiled_models(patch, directory):
     patch.setattr(mujoco.MjModel, "from_binary_path", loaded)
 
 
-@pytest.mark.parametrize("said", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
-def test_mujoco_never_sees_what_nobody_vouches_for(directory, monkeypatch, said):
-    """The error names the file and the ways out; the hash of another is no help."""
-    facts = {**stored(directory), "xml": None}
+@pytest.mark.parametrize("changes", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
+def test_untrusted_models_never_reach_mujoco(directory, monkeypatch, changes):
+    """The error names the file and the ways out; another model's hash does not help."""
+    facts = {**store_model(directory), "xml": None}
     content = bytearray(gzip.decompress((directory / facts["mjb"]).read_bytes()))
     content[-200:] = bytes(200)
     digest = hashlib.sha256(content).hexdigest()
     path = directory / f"openaigym.model.{digest[:16]}.mjb.gz"
     path.write_bytes(gzip.compress(bytes(content)))
-    crafted = {**facts, "mjb": path.name, "sha256": digest, **said}
+    crafted = {**facts, "mjb": path.name, "sha256": digest, **changes}
     forbid_compiled_models(monkeypatch, directory)
     with pytest.raises(UntrustedModel, match="not written by this user") as error:
         load_model(directory, crafted)
@@ -244,15 +232,13 @@ def test_mujoco_never_sees_what_nobody_vouches_for(directory, monkeypatch, said)
         load_model(directory, {**crafted, "sha256": facts["sha256"]})
 
 
-def test_trust_is_said_by_an_argument_or_a_variable(
-    directory, become_another_user, monkeypatch
-):
-    """The hash is looked at all the same; one's own needs no word."""
-    facts = {**stored(directory), "xml": None}
+def test_argument_or_variable_grants_trust(directory, become_another_user, monkeypatch):
+    """The hash is checked all the same; one's own models need no trust."""
+    facts = {**store_model(directory), "xml": None}
     assert load_model(directory, facts).ngeom == 1
     become_another_user()
-    for said in ("0", ""):
-        monkeypatch.setenv(TRUST_VARIABLE, said)
+    for value in ("0", ""):
+        monkeypatch.setenv(TRUST_VARIABLE, value)
         with pytest.raises(UntrustedModel, match="not written by this user"):
             load_model(directory, facts)
     assert load_model(directory, facts, trust_models=True).ngeom == 1
@@ -263,13 +249,10 @@ def test_trust_is_said_by_an_argument_or_a_variable(
         load_model(directory, facts)
 
 
-# --- recordings ----------------------------------------------------------------------
-
-
-def test_frames_of_a_strangers_recording_need_a_word(
+def test_rendering_a_foreign_recording_needs_trust(
     directory, become_another_user, tmp_path, capsys
 ):
-    """Of the trajectory, which goes to the workers too, or of the command."""
+    """Python's or the command's argument grants it, also to the workers."""
     theirs = record(directory)
     become_another_user()
     trajectory = load_trajectory(theirs.path)
@@ -280,17 +263,15 @@ def test_frames_of_a_strangers_recording_need_a_word(
     trusted = load_trajectory(theirs.path, trust_models=True)
     assert trusted.model().ngeom == 3
     np.testing.assert_array_equal(list(mjrec.render(trusted)), theirs.frames)
-    again = ["render", str(theirs.path), "--out", str(tmp_path / "again.mp4")]
-    assert main(again) == 1
+    command = ["render", str(theirs.path), "--out", str(tmp_path / "again.mp4")]
+    assert main(command) == 1
     assert "mjrec render --trust-models" in capsys.readouterr().out
-    assert main([*again, "--trust-models"]) == 0
+    assert main([*command, "--trust-models"]) == 0
     assert TRUST_VARIABLE not in os.environ
 
 
-def test_sources_show_what_the_environment_showed(
-    directory, become_another_user, monkeypatch
-):
-    """With what was set by hand in the model."""
+def test_sources_give_the_same_frames(directory, become_another_user, monkeypatch):
+    """Changes to the compiled model are applied again."""
     size = {"width": 64, "height": 48}
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
     model = env.unwrapped.model
@@ -299,12 +280,12 @@ def test_sources_show_what_the_environment_showed(
     model.geom_size[3, 0] *= 2
     with mjrec.Monitor(env, directory, lambda _: True, workers=0) as monitor:
         monitor.reset()
-        shown = [env.render()]
+        live = [env.render()]
         for _ in range(2):
             monitor.step(np.full(6, 0.1))
-            shown.append(env.render())
+            live.append(env.render())
         monitor.close(wait=False)
     become_another_user()
     forbid_compiled_models(monkeypatch, directory)
     [path] = (recording.path for recording in recordings_in_flight(directory))
-    np.testing.assert_array_equal(list(mjrec.render(path)), shown)
+    np.testing.assert_array_equal(list(mjrec.render(path)), live)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which names in a directory are monitors' files, and what they say."""
+"""Names of monitor files."""
 
 import re
 from pathlib import Path
@@ -10,61 +10,6 @@ from mjrec.formats import monitor_directory
 from mjrec.formats.monitor_directory import camera_part, episode_of, infix_of, with_part
 from mjrec.results.monitor_files import MonitorFiles
 
-VIDEO = "openaigym.video.0.1.video000027"
-OF_EPISODES = [
-    *(
-        f"{VIDEO}.mp4",
-        f"{VIDEO}.meta.json",
-        f".{VIDEO}.lock",
-        f".{VIDEO}.mp4.0123abcd.part",
-    ),
-    "openaigym.trajectory.0.1.episode000027.h5",
-]
-OF_MONITORS = [
-    "openaigym.manifest.0.1.manifest.json",
-    "openaigym.episode_batch.0.1.stats.json",
-    "openaigym.episodes.0.1.jsonl",
-    *(f"openaigym.states.0.1.000000.{end}" for end in ("log", "tail", "looks")),
-    "openaigym.results.0.1.monitor.csv",
-    ".openaigym.0.1.lock",
-    ".openaigym.manifest.0.1.lock",
-    ".openaigym.clip.0.1.step000000137.lock",
-    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
-]
-OF_ALL = ["openaigym.model.0123456789abcdef.zip", ".openaigym.render.3.lock"]
-FOREIGN = [
-    *("openaigym.notes.txt", "openaigym.manifest", "openaigym..manifest.json", "notes"),
-    *("mjrec.evaluation.0.1.jsonl", "openaigym.video.0.1.video27.mp4"),
-    "openaigym.states.0.1.log",
-]
-
-
-def test_names_say_monitor_and_episode_and_are_listed(tmp_path):
-    """Hidden ones if asked for; no directories, and links that lead to files."""
-    for names, said in (
-        (OF_EPISODES, ("0.1", 27)),
-        (OF_MONITORS, ("0.1", None)),
-        # A part of a clip is only ever in a log.
-        (["openaigym.clip.0.1.step000000137.part000000"], ("0.1", None)),
-        (OF_ALL + FOREIGN, (None, None)),
-    ):
-        for name in names:
-            assert (infix_of(name), episode_of(name)) == said, name
-            (tmp_path / name).touch()
-    (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
-    links = [f"openaigym.manifest.{n}.1.manifest.json" for n in range(2, 6)]
-    for name, target in zip(links, ["notes", "gone", ".", links[3]], strict=True):
-        (tmp_path / name).symlink_to(target)
-    expected = sorted([*OF_EPISODES, *OF_MONITORS, *OF_ALL, links[0]])
-    listed = monitor_directory.iter_monitor_files(tmp_path, hidden=True)
-    assert [path.name for path in listed] == expected
-    listed = monitor_directory.iter_monitor_files(tmp_path)
-    assert [path.name for path in listed] == [n for n in expected if n[0] != "."]
-    assert list(monitor_directory.iter_monitor_files(tmp_path / "missing")) == []
-
-
-# --- what a camera is called ---------------------------------------------------------
-
 FIRST = "openaigym.video.0.7.video000027.mp4"
 CAMERAS = (
     *("side", "top-left_2", "a b", "über", "../up", "/etc", "a.b~c", "", "%41", "\n"),
@@ -74,22 +19,21 @@ CAMERAS = (
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_a_name_stays_in_its_directory_and_is_short(name):
-    """However the model calls its camera; it is no first video's."""
+def test_camera_gives_a_short_unique_file_name(name):
+    """It stays in its directory, whatever the camera's name."""
     part = camera_part(name)
     file = with_part(FIRST, part)
     assert (infix_of(file), episode_of(file)) == ("0.7", 27)
     assert MonitorFiles("0.7", [Path(file)]).videos == {}
     assert re.fullmatch(r"[A-Za-z0-9_%-]{1,90}", part)
     assert len(f".{file}.framehash.12345678.part") < 255
-    # None is taken for another one, or for another part of a name.
     assert [other for other in CAMERAS if camera_part(other) == part] == [name]
     taken = ("tiled", "draft", "full", "640x480", "25fps", "meta", "plain", "annotated")
     assert part not in taken
 
 
 def test_further_cameras_never_share_a_name():
-    """Numbers are their digits, nameless ones are called by their place."""
+    """A number becomes its digits; an unnamed camera gets its position."""
     assert camera_part("a b/ü.~") == "a%20b%2F%C3%BC%2E%7E"
     cameras = ["a", "side", {"distance": 1}, 1, "1", "side", "1-2", "camera3", "a"]
     assert monitor_directory.further_parts(cameras) == [
@@ -97,8 +41,7 @@ def test_further_cameras_never_share_a_name():
     ]
 
 
-def test_gymnasiums_names_are_second_names():
-    """With any prefix that is portable; others may come from a file of anybody's."""
+def test_second_names_are_portable_gymnasium_names():
     is_second_name = monitor_directory.is_second_name
     for name in ("rl-video-episode-27.mp4", "a-step-0.mp4", "_.x-1-episode-3.mp4"):
         assert is_second_name(name)

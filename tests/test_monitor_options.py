@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of `mjrec.Monitor` that cannot be are refused before anything is made."""
+"""Invalid options of `mjrec.Monitor` are refused before any file is made."""
 
 import gc
 
@@ -26,12 +26,13 @@ ENVIRONMENTS = {
     "cheetah": cheetah,
     "overlay": lambda: Overlay(cheetah()),
 }
-IMPOSSIBLE = {
+INVALID = {
     "corridor": [
         ({"video_callable": True}, "InvalidArgument", "video_callable"),
         ({"mode": "testing"}, "InvalidArgument", "training"),
         ({"fps": True}, "InvalidArgument", "fps"),
         ({"trajectory_callable": 5}, "InvalidArgument", "trajectory_callable"),
+        ({"policy_file": "none.zip"}, "InvalidArgument", "policy_file"),
         *(
             ({"uid": uid}, "InvalidArgument", "uid")
             for uid in ("", "a/b", ".hidden", "a b", "é", "x" * 101)
@@ -98,12 +99,11 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(
-    ("made", "options", "error", "words"),
-    [(made, *case) for made, cases in IMPOSSIBLE.items() for case in cases],
+    ("name", "options", "error", "words"),
+    [(name, *case) for name, cases in INVALID.items() for case in cases],
 )
-def test_impossible_options_leave_nothing(made, options, error, words, tmp_path):
-    """One error with the way out; no file, and the user's environment still works."""
-    env = ENVIRONMENTS[made]()
+def test_invalid_options_leave_no_files(name, options, error, words, tmp_path):
+    env = ENVIRONMENTS[name]()
     with pytest.raises(getattr(mjrec, error), match=words):
         mjrec.Monitor(env, tmp_path / "new", **options)
     gc.collect()
@@ -113,7 +113,6 @@ def test_impossible_options_leave_nothing(made, options, error, words, tmp_path)
     env.close()
 
 
-def test_what_is_no_environment_is_named(tmp_path):
-    """With its type."""
+def test_object_that_is_no_environment_is_refused(tmp_path):
     with pytest.raises(mjrec.InvalidArgument, match=r"builtins\.dict"):
         mjrec.Monitor({}, tmp_path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What recordings look like in a notebook."""
+"""Recordings in notebooks."""
 
 import base64
 import re
@@ -11,7 +11,6 @@ from mjrec.formats import notebook
 
 
 def videos_in(text):
-    """Return the videos that an output holds."""
     found = re.findall(r'src="data:video/mp4;base64,([^"]+)"', text)
     return [base64.b64decode(each) for each in found]
 
@@ -19,21 +18,15 @@ def videos_in(text):
 # Takes more than five seconds: an episode is evaluated, and drawn twice.
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Evaluate an episode; return its video, and what can be shown of it, by kind."""
+    """Evaluate an episode; return its video, and displayable objects by kind."""
     small = {"episodes": 1, "num_seeds": 1, "max_steps": 2, "height": 32, "width": 32}
-    evaluation = mjrec.evaluate(
-        ["InvertedPendulum-v5"],
-        policy="zero",
-        directory=tmp_path_factory.mktemp("evaluation") / "results",
-        workers=1,
-        keep="all",
-        **small,
-    )
+    directory = tmp_path_factory.mktemp("evaluation") / "results"
+    options = {"policy": "zero", "directory": directory, "workers": 1, "keep": "all"}
+    evaluation = mjrec.evaluate(["InvertedPendulum-v5"], **options, **small)
     [video] = evaluation.videos
     [episode] = mjrec.iter_episodes(video.parent)
-    rendered = mjrec.render_videos(
-        video.parent, episode=episode.episode_id, height=48, width=48
-    )
+    chosen = {"episode": episode.episode_id, "height": 48, "width": 48}
+    rendered = mjrec.render_videos(video.parent, **chosen)
     return video, {
         "evaluation": evaluation,
         "episode": episode,
@@ -43,40 +36,35 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
+    ("kind", "texts"),
     [
         ("evaluation", ["<td>episodes</td><td>1</td>", "InvertedPendulum-v5", "95%"]),
         ("episode", ["Episode 0", "<td>steps</td><td>2</td>", "truncated"]),
-        (
-            "trajectory",
-            ["InvertedPendulum-v5, episode 0", "<td>return</td><td>2</td>"],
-        ),
+        ("trajectory", ["InvertedPendulum-v5, episode 0", "<td>return</td><td>2</td>"]),
         ("rendered", ["1 rendered, 0 failed", "<td>frames</td><td>3</td>", "48x48"]),
     ],
 )
-def test_a_recording_shows_numbers_and_a_player(kind, said, recorded):
-    """The video is in the output itself, byte for byte, and its name below it."""
-    path, shown = recorded
-    text = shown[kind]._repr_html_()
+def test_recording_shows_numbers_and_a_player(kind, texts, recorded):
+    """The output embeds the video, with its name below it."""
+    path, displayed = recorded
+    text = displayed[kind]._repr_html_()
     if kind == "rendered":
-        [path] = [path.parent / name for name in shown[kind].videos]
+        [path] = [path.parent / name for name in displayed[kind].videos]
     assert videos_in(text) == [path.read_bytes()]
-    for words in (*said, path.name, "<video "):
+    for words in (*texts, path.name, "<video "):
         assert words in text
 
 
 def test_text_of_files_is_escaped(tmp_path):
-    """What a stranger's file says never becomes a part of the page."""
     bad = "<script>alert(1)</script>"
-    text = notebook.shown(
-        bad, {bad: bad}, [tmp_path / f"{bad}.mp4"], columns=[bad], rows=[[bad]]
-    )
+    paths = [tmp_path / f"{bad}.mp4"]
+    text = notebook.shown(bad, {bad: bad}, paths, columns=[bad], rows=[[bad]])
     assert "<script" not in text
     assert text.count("&lt;script") >= 5
 
 
 def test_large_and_missing_videos_are_named(tmp_path, monkeypatch):
-    """An output stays small: what does not fit, or is gone, or a link, is a name."""
+    """Videos beyond the limit, missing ones and links are names only."""
     monkeypatch.setattr(notebook, "MOST_BYTES", 10)
     for name, size in (("a", 6), ("b", 5), ("c", 4)):
         (tmp_path / f"{name}.mp4").write_bytes(name.encode() * size)

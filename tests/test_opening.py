@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a monitor may record, and with which number it begins."""
+"""Directories that a monitor may record into, and its first episode number."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def monitor(directory, **options):
 
 
 def first_number(directory, **options):
-    """Return the number that a monitor begins with, and forget the monitor."""
+    """Return a new monitor's first number, and remove the monitor."""
     opened = monitor(directory, **{"resume": True, **options})
     opened.close()
     for path in directory.glob(f"*{opened.infix}*"):
@@ -38,7 +38,7 @@ def write_video(directory, infix, episode):
 
 
 def test_force_deletes_monitor_files_only(tmp_path, names):
-    """Others' files are no recordings, and stay, whatever their names begin with."""
+    """Other files stay, whatever their names begin with."""
     others = ["notes.txt", "openaigym.manifest.1.1.manifest.json", "openaigym.txt"]
     (tmp_path / others[1]).mkdir()
     for name in (others[0], others[2]):
@@ -50,17 +50,17 @@ def test_force_deletes_monitor_files_only(tmp_path, names):
             monitor(tmp_path, force=True)
 
 
-def test_resume_goes_on_after_the_highest_number(tmp_path):
-    """Of closed and dead runs, or of those with its uid; to join looks at no files."""
+def test_resume_continues_after_the_highest_number(tmp_path):
+    """A uid limits this to its own runs; "join" reads no files."""
     write_video(tmp_path, "0.1", 0)
-    # A crashed run's videos count as recordings.
+    # Videos alone count as recordings.
     with pytest.raises(ExistingRecordings, match=r"(?s)mp4.*resume=True.*force"):
         monitor(tmp_path)
     record(tmp_path, resume=True)
     assert first_number(tmp_path) == 3
     write_video(tmp_path, "0.alice", 7)
     write_video(tmp_path, "0.bob", 3)
-    # A number that makes names which no file can have does not count.
+    # Numbers too long for a file name do not count.
     write_video(tmp_path, "0.x", 10**150)
     for uid, expected in (("bob", 4), ("alice", 8), ("carol", 0), (None, 8)):
         assert first_number(tmp_path, uid=uid) == expected
@@ -68,8 +68,7 @@ def test_resume_goes_on_after_the_highest_number(tmp_path):
     assert first_number(tmp_path, resume="join", env_id=ANOTHER) == 0
 
 
-def test_resume_never_takes_a_used_name(tmp_path):
-    """A uid that was used before gets another monitor id."""
+def test_resume_never_reuses_a_monitor_id(tmp_path):
     used = {f"{number}.same" for number in range(50)}
     for infix in used:
         write_video(tmp_path, infix, 0)
@@ -78,8 +77,8 @@ def test_resume_never_takes_a_used_name(tmp_path):
         assert len({one.infix, other.infix} - used) == 2
 
 
-def test_a_torn_line_keeps_its_number(tmp_path, caplog):
-    """Its episode is lost, and the next one is not taken for it; the log says so."""
+def test_torn_line_keeps_its_number(tmp_path, caplog):
+    """Its episode is lost, and the log says so."""
     journal = write_journal(tmp_path, "0.7", 0, 1, run={"env_info": ENV_INFO})
     journal.write_bytes(journal.read_bytes()[:-20])
     assert first_number(tmp_path) == 2
@@ -87,15 +86,14 @@ def test_a_torn_line_keeps_its_number(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("number", [True, -1, 1.5, "7", 10**4000, {}])
-def test_an_impossible_next_number_is_an_error(tmp_path, number):
-    """A manifest may come from anybody; numbers go into names of files."""
+def test_invalid_next_number_is_an_error(tmp_path, number):
     path = write_saved(tmp_path, "0.7", details={"next_episode_id": number})
     with pytest.raises(mjrec.UnreadableFile, match=rf"{path.name}.*next_episode_id"):
         monitor(tmp_path, resume=True)
 
 
 def test_resume_over_another_environment_is_an_error(tmp_path):
-    """Also while it is open, or killed with its journal alone left; both are named."""
+    """The error names both, also for an open or killed monitor."""
     again = {"resume": True, "env_id": ANOTHER}
     with monitor(tmp_path / "a") as env:
         with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
@@ -111,24 +109,24 @@ def test_resume_over_another_environment_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "said"),
+    ("path", "reason"),
     [
         *((path, path.removeprefix("{}")) for path in ("{}/file", "/proc/self")),
         ("/proc/mjrec/recordings", "/proc/mjrec/recordings"),
         ("{}/" + "x" * 300, "too long"),
     ],
 )
-def test_an_impossible_directory_is_an_error(path, said, tmp_path):
-    """It names the path; of a directory without room nothing is left."""
+def test_unwritable_directory_is_an_error(path, reason, tmp_path):
+    """A full disk leaves no directory."""
     (tmp_path / "file").touch()
-    with pytest.raises(DirectoryNotWritable, match=said):
+    with pytest.raises(DirectoryNotWritable, match=reason):
         monitor(Path(path.format(tmp_path)))
     with file_size_limit(0), pytest.raises(DirectoryNotWritable):
         monitor(tmp_path / "a" / "b")
     assert not (tmp_path / "a").exists()
 
 
-def test_joining_leaves_killed_monitors_as_they_are(tmp_path, caplog):
+def test_join_leaves_killed_monitors_alone(tmp_path, caplog):
     """`resume=True` recovers them."""
     env_id = ENV_INFO["env_id"]
     dead = write_log(tmp_path, infix="0.1", ended=False, env_id=env_id)

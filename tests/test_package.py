@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel: what is in it, what it says of itself, and that it works alone."""
+"""The wheel's content and metadata, and its use alone."""
 
 import email
 import os
@@ -18,19 +18,18 @@ SOURCE = ROOT / "src"
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Build the wheel from the working tree, without a network; return its files."""
-    pytest.importorskip("build", reason="the packages' tools are not here")
+    """Build the wheel without a network; return its files."""
+    pytest.importorskip("build", reason="the tools for packages are missing")
     folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
-    command = [*build, "--outdir", str(folder), str(ROOT)]
+    command = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
+    command += ["--outdir", str(folder), str(ROOT)]
     subprocess.run(command, check=True, capture_output=True, timeout=280)
     [path] = folder.glob("*.whl")
     with zipfile.ZipFile(path) as packed:
         return {name: packed.read(name) for name in packed.namelist()}
 
 
-def test_wheel_holds_the_package_and_nothing_else(wheel):
-    """Every file of the package, templates and tables too; no tests or benchmarks."""
+def test_wheel_contains_exactly_the_package(wheel):
     package = {
         str(path.relative_to(SOURCE))
         for path in (SOURCE / "mjrec").rglob("*")
@@ -41,8 +40,7 @@ def test_wheel_holds_the_package_and_nothing_else(wheel):
     assert any(name.endswith("licenses/LICENSE") for name in wheel)
 
 
-def test_metadata_says_what_it_is_for(wheel):
-    """README, licence, Pythons, and a typed package; no address that is made up."""
+def test_metadata_has_license_version_and_typing(wheel):
     [name] = [n for n in wheel if n.endswith("dist-info/METADATA")]
     about = email.message_from_bytes(wheel[name])
     assert about["Name"] == "mjrec"
@@ -55,19 +53,14 @@ def test_metadata_says_what_it_is_for(wheel):
 
 @pytest.mark.wheel
 def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path):
-    """In an environment that holds it and what it depends on, far from the sources."""
+    """The environment holds the wheel and its dependencies alone."""
     python = os.environ.get("MJREC_TEST_WHEEL")
     if python is None:
         pytest.fail("scripts/test --all names an environment with the wheel.")
 
     def run(*arguments):
-        done = subprocess.run(
-            [python, *arguments],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=280,
-        )
+        options = {"capture_output": True, "text": True, "timeout": 280}
+        done = subprocess.run([python, *arguments], cwd=tmp_path, **options)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies by their names, and the actions that they give."""
+"""Loading policies by name, and checking their actions."""
 
 import sys
 from pathlib import Path
@@ -25,14 +25,13 @@ MIXED = spaces.Dict(
 )
 
 
-def acting_in(space):
-    """Return something that has an action space, as a Gymnasium environment has."""
+def environment_with(space):
     return SimpleNamespace(action_space=space)
 
 
 @pytest.fixture
 def write(tmp_path, monkeypatch):
-    """Write a module into the working directory; forget it afterwards."""
+    """Write modules into the working directory, and unload them afterwards."""
     monkeypatch.chdir(tmp_path)
     written = []
 
@@ -45,7 +44,7 @@ def write(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-BOX = acting_in(spaces.Box(-1, 1, (2,), np.float32))
+BOX = environment_with(spaces.Box(-1, 1, (2,), np.float32))
 
 
 def load(name, environment=BOX, **kwargs):
@@ -58,25 +57,22 @@ BOUNDS = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
 @pytest.mark.parametrize(
     "space", [spaces.Box(-np.inf, np.inf, (2,), np.float64), MIXED, spaces.Box(*BOUNDS)]
 )
-def test_random_actions_are_the_episodes(space):
-    """They lie in the space, the same for a seed, and leave others' draws alone.
+def test_random_actions_depend_on_the_episode_seed_alone(space):
+    """They equal `space.sample()` and leave the space's own generator alone."""
 
-    Bounded boxes are drawn in another way than by `sample`, which gives the same.
-    """
-
-    def drawn(policy, episode):
+    def draw(policy, episode):
         policy.reset(episode_seeds(0, episode))
         return [policy(None) for _ in range(20)]
 
     space.seed(9)
-    own = repr(space.sample())
+    next_sample = repr(space.sample())
     space.seed(9)
-    policy = load_policy("random", acting_in(space))
-    first = drawn(policy, 3)
+    policy = load_policy("random", environment_with(space))
+    first = draw(policy, 3)
     assert all(space.contains(action) for action in first)
-    assert repr(drawn(policy, 4)) != repr(first)
-    assert repr(drawn(load_policy("random", acting_in(space)), 3)) == repr(first)
-    assert repr(space.sample()) == own
+    assert repr(draw(policy, 4)) != repr(first)
+    assert repr(draw(load_policy("random", environment_with(space)), 3)) == repr(first)
+    assert repr(space.sample()) == next_sample
     space.seed(episode_seeds(0, 3).actions)
     assert repr([space.sample() for _ in range(20)]) == repr(first)
 
@@ -91,8 +87,8 @@ def test_random_actions_are_the_episodes(space):
     ],
 )
 def test_zero_is_the_action_nearest_to_zero(space, zero):
-    """Within the bounds, of the space's own type, also after one wrote into it."""
-    policy = load_policy("zero", acting_in(spaces.Tuple([space])))
+    """A caller may write into an earlier action."""
+    policy = load_policy("zero", environment_with(spaces.Tuple([space])))
     for _ in range(2):
         policy.reset(SEEDS)
         [action] = policy(None)
@@ -102,8 +98,8 @@ def test_zero_is_the_action_nearest_to_zero(space, zero):
             action[:] = 7
 
 
-def test_dm_envs_actions_are_drawn_within_their_bounds():
-    """Nested ones too; a number without bounds is drawn around zero."""
+def test_dm_env_actions_are_drawn_within_their_bounds():
+    """Unbounded numbers are drawn around zero."""
     specs = pytest.importorskip("dm_env").specs
     spec = {
         "bounded": specs.BoundedArray((2,), np.float32, [-1, 2.1], [0, 3]),
@@ -142,8 +138,8 @@ def test_dm_envs_actions_are_drawn_within_their_bounds():
         (spaces.Dict(a=BOX.action_space), {"a": [0, 9]}, {"a": [0, 9]}),
     ],
 )
-def test_actions_of_other_types_are_taken(space, action, taken):
-    """Policies give float64, lists, and arrays of one number."""
+def test_actions_of_other_types_are_converted(space, action, taken):
+    """Policies return float64, lists, and arrays of one number."""
     found = checked(space, action)
     assert taken == (found.tolist() if isinstance(found, np.ndarray) else found)
     assert type(taken) is not int or type(found) is int
@@ -164,9 +160,9 @@ def test_actions_of_other_types_are_taken(space, action, taken):
         (spaces.Tuple([spaces.Discrete(2)]), (1, 1)),
     ],
 )
-def test_what_is_no_action_is_refused(space, action):
-    """The message says what the space is and what came."""
-    policy = policy_from(lambda _: action, "mine", acting_in(space))
+def test_invalid_action_is_refused(space, action):
+    """The error names the space and the action."""
+    policy = policy_from(lambda _: action, "mine", environment_with(space))
     with pytest.raises(mjrec.PolicyError, match="must return an action in ") as caught:
         policy(None)
     assert str(space) in str(caught.value)
@@ -174,7 +170,7 @@ def test_what_is_no_action_is_refused(space, action):
 
 
 def test_functions_classes_and_calls_are_policies(write):
-    """A class is built with the environment and arguments, and gets the seeds."""
+    """A class gets the environment, arguments and seeds."""
     write(
         "import mjrec_test_neighbour\n"
         "def double(observation): return observation * 2\n"
@@ -195,8 +191,7 @@ def test_functions_classes_and_calls_are_policies(write):
     policy = load("Policy", last=7)
     policy.reset(SEEDS)
     assert policy(None) == [3, 7]
-    # The working directory was importable, and is no more.
-    assert sys.path == path
+    assert sys.path == path  # the working directory was importable during loading
     with pytest.raises(mjrec.PolicyError, match="unexpected keyword argument 'scale'"):
         load("Policy", scale=3)
     for name in ("random", "mjrec_test_policy:double"):
@@ -204,8 +199,8 @@ def test_functions_classes_and_calls_are_policies(write):
             load_policy(name, BOX, {"scale": 3})
 
 
-def test_predict_is_understood():
-    """Stable-Baselines3's: deterministic, with state and start of the episode."""
+def test_predict_is_called_as_stable_baselines3_does():
+    """The call is deterministic and passes state and episode start."""
 
     class Model:
         calls = []  # noqa: RUF012  one object
@@ -227,12 +222,12 @@ def test_predict_is_understood():
         policy("a")
         policy("b")
     assert Model.calls == [("a", None, True, True), ("b", 1, False, True)] * 2
-    # One of fewer arguments that gives just the action.
+    # A `predict` with fewer arguments that returns only the action.
     assert policy_from(Short(), "short", BOX)(1) == [1, 0]
 
 
-REFUSED = [
-    # Built-in names, modules nearby, names in the module, files nearby.
+INVALID = [
+    # Similar built-in names, modules, names in the module, and files.
     ("", "rnd", mjrec.UnknownName, "'rnd'.*random, zero.*module:name"),
     ("", ":act", mjrec.UnknownName, "module:name"),
     ("", "mjrec_test_plicy:act", mjrec.UnknownName, "'mjrec_test_plicy'.*test_policy"),
@@ -241,7 +236,7 @@ REFUSED = [
         *("import math\ndef act(o): pass\nclass Other: pass\n_x = 1\n", "atc"),
         *(mjrec.UnknownName, "'atc'.*Available: Other, act"),
     ),
-    # Where it happened.
+    # The line of the error.
     (
         *("def f(o): pass\n1 / 0\n", "f", mjrec.PolicyError),
         r"ZeroDivisionError.*mjrec_test_policy.py, line 2",
@@ -252,17 +247,15 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "name", "kind", "words"), REFUSED)
-def test_what_is_no_policy_says_what_there_is(write, text, name, kind, words):
-    """Or what is wrong with it."""
+@pytest.mark.parametrize(("text", "name", "kind", "words"), INVALID)
+def test_invalid_policy_names_alternatives_or_the_error(write, text, name, kind, words):
     write(text)
     Path("best.zip").touch()
     with pytest.raises(kind, match=words):
         load_policy(f"mjrec_test_policy:{name}" if text else name, BOX)
 
 
-def test_what_a_policy_raises_is_named(write):
-    """While it is built, reset, or asked; with the line of its own file."""
+def test_policy_errors_name_call_and_line(write):
     write(
         "class Late:\n"
         "    def __init__(self, environment): pass\n"
@@ -283,19 +276,3 @@ def test_what_a_policy_raises_is_named(write):
         load("Early")
     with pytest.raises(mjrec.PolicyError, match=r"Alone.* Give it a parameter"):
         load("Alone")
-
-
-def test_an_object_is_a_policy_as_what_a_name_names():
-    """Functions and classes need no module to be found in."""
-
-    class Still:
-        def __init__(self, environment, value=0):
-            self.action = np.full(environment.action_space.shape, value)
-
-        def __call__(self, observation):
-            return self.action
-
-    assert policy_from(lambda _: [0.5, 0], "half", BOX)(None) == [0.5, 0]
-    assert policy_from(Still, "Still", BOX, {"value": 1})(None).tolist() == [1, 1]
-    with pytest.raises(mjrec.PolicyError, match="mine is 3"):
-        policy_from(3, "mine", BOX)

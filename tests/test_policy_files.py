@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies in files: model.zip, TorchScript and ONNX act as their libraries say."""
+"""Policies in files: model.zip, TorchScript, torch.export and ONNX."""
 
 import json
 import sys
@@ -16,10 +16,9 @@ from mjrec.environments.policies import load_policy, policy_file
 
 SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
 
-# Of torch, which prefers its newer formats.
+# Torch deprecates its older formats.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*torch:DeprecationWarning"),
-    # From 2.15 on torch says of TorchScript that `torch.export` follows it.
     pytest.mark.filterwarnings("ignore:.*torch.jit:FutureWarning"),
 ]
 
@@ -32,16 +31,14 @@ pytestmark = [
         ("a.onnx", "onnxruntime", "onnx"),
     ],
 )
-def test_a_missing_library_is_named(name, library, extra, tmp_path, monkeypatch):
-    """With the line that installs it."""
+def test_missing_library_names_the_extra(name, library, extra, tmp_path, monkeypatch):
     for module in [m for m in sys.modules if m.partition(".")[0] == library]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
     (tmp_path / name).touch()
     env = gymnasium.make("InvertedPendulum-v5")
-    with pytest.raises(
-        mjrec.MissingDependency, match=rf'pip install "mjrec\[{extra}\]"'
-    ):
+    advice = rf'pip install "mjrec\[{extra}\]"'
+    with pytest.raises(mjrec.MissingDependency, match=advice):
         load_policy(str(tmp_path / name), env)
 
 
@@ -54,8 +51,7 @@ def test_a_missing_library_is_named(name, library, extra, tmp_path, monkeypatch)
         ("DQN", "CartPole-v1", {}),
     ],
 )
-def test_a_saved_model_acts_as_it_predicts(algorithm, env_id, options, tmp_path):
-    """Deterministically and within its bounds; also where observations are float64."""
+def test_saved_model_acts_deterministically(algorithm, env_id, options, tmp_path):
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     env = gymnasium.make(env_id)
     small = {"seed": 0, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
@@ -67,16 +63,15 @@ def test_a_saved_model_acts_as_it_predicts(algorithm, env_id, options, tmp_path)
     for seed in range(5):
         observation, _ = env.reset(seed=seed)
         policy.reset(SEEDS)
-        for seen in (observation * 50, observation):
-            expected, _ = model.predict(seen, deterministic=True)
-            assert np.array_equal(policy(seen), expected)
+        for each in (observation * 50, observation):
+            expected, _ = model.predict(each, deterministic=True)
+            assert np.array_equal(policy(each), expected)
     with pytest.raises(mjrec.PolicyError, match="unexpected keyword argument 'speed'"):
         load_policy(str(path), env, {"speed": 2})
 
 
 @pytest.mark.stable_baselines3
-def test_what_is_in_no_such_file_is_refused(tmp_path):
-    """Weights are no network; a zip file is no model."""
+def test_files_without_a_network_are_refused(tmp_path):
     torch = pytest.importorskip("torch")
     env = gymnasium.make("InvertedPendulum-v5")
     torch.save(torch.nn.Linear(4, 1).state_dict(), tmp_path / "weights.pt")
@@ -90,17 +85,17 @@ def test_what_is_in_no_such_file_is_refused(tmp_path):
 WEIGHTS = np.array([[2.0, 4.0]] * 3, np.float32)
 
 
-def exported(directory, kind):
-    """Write the network that gives twice the sum of an observation, and its double."""
+def export_network(directory, kind):
+    """Write a network that returns 2 and 4 times the sum of its observation."""
     path = directory / f"network.{kind}"
     if kind == "onnx":
         pytest.importorskip("onnxruntime")
         onnx = pytest.importorskip("onnx")
         helper, single = onnx.helper, onnx.TensorProto.FLOAT
         graph = helper.make_graph(
-            [helper.make_node("MatMul", ["seen", "weights"], ["action"])],
+            [helper.make_node("MatMul", ["observed", "weights"], ["action"])],
             "network",
-            [helper.make_tensor_value_info("seen", single, [1, 3])],
+            [helper.make_tensor_value_info("observed", single, [1, 3])],
             [helper.make_tensor_value_info("action", single, [1, 2])],
             [onnx.numpy_helper.from_array(WEIGHTS, "weights")],
         )
@@ -108,22 +103,22 @@ def exported(directory, kind):
         onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), path)
         return path
     torch = pytest.importorskip("torch")
-    network, seen = torch.nn.Linear(3, 2, bias=False), torch.zeros(1, 3)
+    network, observed = torch.nn.Linear(3, 2, bias=False), torch.zeros(1, 3)
     with torch.no_grad():
         network.weight[:] = torch.from_numpy(WEIGHTS.T)
     if kind == "pt2":
-        torch.export.save(torch.export.export(network, (seen,)), path)
+        torch.export.save(torch.export.export(network, (observed,)), path)
     else:
-        torch.jit.trace(network, seen).save(str(path))
+        torch.jit.trace(network, observed).save(str(path))
     return path
 
 
 @pytest.mark.stable_baselines3
 @pytest.mark.parametrize("kind", ["pt", "pt2", "onnx"])
-def test_a_network_gets_a_row_and_gives_one(kind, tmp_path):
-    """Of float32, whatever the observation is made of; actions are kept in bounds."""
+def test_network_gets_float32_rows(kind, tmp_path):
+    """Actions are clipped to their bounds."""
     env = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
-    policy = load_policy(str(exported(tmp_path, kind)), env)
+    policy = load_policy(str(export_network(tmp_path, kind)), env)
     policy.reset(SEEDS)
     assert policy(np.array([0.1, 0.2, -0.1])).tolist() == pytest.approx([0.4, 0.8])
     parts = {"pose": np.array([[0.1], [0.2]]), "speed": -0.1}
@@ -132,8 +127,7 @@ def test_a_network_gets_a_row_and_gives_one(kind, tmp_path):
 
 
 @pytest.mark.stable_baselines3
-def test_a_network_is_recorded(tmp_path, monkeypatch, capsys):
-    """By its file's name, from the command line."""
+def test_command_records_a_network_by_file_name(tmp_path, monkeypatch, capsys):
     torch = pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     torch.jit.trace(torch.nn.Linear(4, 1), torch.zeros(1, 4)).save("net.pt")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress of rendering, where no terminal shows a bar."""
+"""The progress of rendering without a terminal."""
 
 import io
 from types import SimpleNamespace
@@ -21,8 +21,9 @@ LINES = [
 
 
 @pytest.mark.parametrize("where", ["log", "console", "quiet"])
-def test_a_log_gets_a_line_now_and_then(where, monkeypatch, caplog, capsys):
-    """After five seconds, then every 30; a quiet console gets none."""
+def test_log_gets_a_line_after_5_seconds_then_every_30(
+    where, monkeypatch, caplog, capsys
+):
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: clock.now))
     console = None
@@ -36,8 +37,7 @@ def test_a_log_gets_a_line_now_and_then(where, monkeypatch, caplog, capsys):
     assert (caplog.messages or capsys.readouterr().err.splitlines()) == expected
 
 
-def test_close_says_that_it_waits(tmp_path, monkeypatch, caplog):
-    """A program without a terminal does not look as if it hung."""
+def test_close_logs_that_it_waits_for_rendering(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(progress, "_FIRST_LINE_S", 0.0)
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
     with mjrec.Monitor(env, tmp_path, height=32, width=32, workers=1) as monitor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a manifest says of what a recording was made with."""
+"""The provenance of a recording in its manifest."""
 
 import hashlib
 import importlib.metadata
@@ -10,7 +10,6 @@ import pytest
 from other_python import run_python
 from recordings import manifest_of
 
-import mjrec
 from mjrec import provenance
 from mjrec.machine import machine_fingerprint
 from mjrec.provenance import Provenance, installed_packages
@@ -30,8 +29,8 @@ def git(directory, *arguments):
     return subprocess.check_output(command, cwd=directory, text=True).strip()
 
 
-def test_a_program_in_a_repository(tmp_path, tmp_path_factory, monkeypatch):
-    """Its command, packages, variables, commit and policy are in the manifest."""
+def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
+    """The manifest has its command, packages, variables, commit and policy."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")
     git(tmp_path, "remote", "add", "origin", "https://example.org/robot.git")
@@ -58,22 +57,15 @@ def test_a_program_in_a_repository(tmp_path, tmp_path_factory, monkeypatch):
         "sha256": hashlib.sha256(b"weights").hexdigest(),
     }
     (tmp_path / "train.py").write_text("pass\n")
-    # A busy machine takes longer than a monitor waits.
+    # A busy machine takes longer than the monitor's timeout.
     monkeypatch.setattr(provenance, "_SECONDS_AT_THE_END", 60)
     assert Provenance(tmp_path).found(wait=True)["code"]["dirty"] is True
     elsewhere = tmp_path_factory.mktemp("none")
     assert Provenance(elsewhere).found(wait=True)["code"] is None
 
 
-def test_a_policy_file_must_be_there(corridor, tmp_path):
-    """Else its hash would be found missing when the paper is out."""
-    with pytest.raises(mjrec.InvalidArgument, match="policy_file"):
-        mjrec.Monitor(corridor, tmp_path / "out", policy_file=tmp_path / "none.zip")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_process_that_exits_at_once_says_nothing():
-    """The child that lists the packages goes with it."""
+def test_short_process_exits_silently():
+    """The child that lists packages ends with it."""
     program = (
         "import logging; logging.basicConfig()\n"
         "from mjrec import child_python, provenance\n"
@@ -84,8 +76,8 @@ def test_a_process_that_exits_at_once_says_nothing():
 
 
 @pytest.mark.parametrize("way", ["child", "no child", "child that fails"])
-def test_packages_are_those_that_python_itself_names(way, tmp_path, monkeypatch):
-    """All of them, in the order of their names, whichever process reads them."""
+def test_packages_equal_those_of_importlib(way, tmp_path, monkeypatch):
+    """Without a working child this process lists them."""
     program = tmp_path / "python"
     if way == "child that fails":
         program.write_text("#!/bin/sh\necho '{}'\nexit 3\n")
@@ -101,12 +93,12 @@ def test_packages_are_those_that_python_itself_names(way, tmp_path, monkeypatch)
     assert list(found) == sorted(found, key=str.lower)
 
 
-OF_THE_WHEEL = [
+WHEEL_LINES = [
     '"gripper/with,comma.py",sha256=def,3',
     "gripper-1.5.dist-info/METADATA,sha256=jkl,5",
     "gripper/__init__.py,sha256=abc,12",
 ]
-OF_THE_INSTALLER = [
+INSTALLER_LINES = [
     "gripper/__pycache__/__init__.cpython-311.pyc,,",
     "gripper-1.5.dist-info/RECORD,,",
     "gripper-1.5.dist-info/INSTALLER,sha256=ghi,4",
@@ -114,18 +106,18 @@ OF_THE_INSTALLER = [
 ]
 
 
-def test_hashes_are_of_what_a_wheel_consists_of(tmp_path, monkeypatch):
-    """In any order, without an installer's lines; of the first version on the path."""
+def test_package_hashes_cover_the_wheel_alone(tmp_path, monkeypatch):
+    """The first version on the path counts; an installer's lines do not."""
     for version in ("1.5", "3.0"):
         info = tmp_path / version / f"gripper-{version}.dist-info"
         info.mkdir(parents=True)
         (info / "METADATA").write_text(f"Name: Gripper\nVersion: {version}\n")
     places = [tmp_path / "1.5", None, str(tmp_path / "1.5"), str(tmp_path / "3.0")]
-    # What is no text on the path is passed over, as Python's own import does.
+    # Entries of another type are skipped, as imports do.
     monkeypatch.setattr(sys, "path", [*places, *sys.path])
     found = installed_packages()["Gripper"]
     assert found == {"version": "1.5", "record_sha256": None}
     record = next(tmp_path.glob("1.5/*")) / "RECORD"
-    record.write_text("\n".join(reversed(OF_THE_WHEEL + OF_THE_INSTALLER)) + "\n")
-    expected = hashlib.sha256("\n".join(OF_THE_WHEEL).encode()).hexdigest()
+    record.write_text("\n".join(reversed(WHEEL_LINES + INSTALLER_LINES)) + "\n")
+    expected = hashlib.sha256("\n".join(WHEEL_LINES).encode()).hexdigest()
     assert installed_packages()["Gripper"]["record_sha256"] == expected

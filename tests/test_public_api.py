@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The layers of the package, its public names, and what importing it loads."""
+
 import ast
 import importlib.metadata
 from pathlib import Path
@@ -35,7 +37,7 @@ ROWS = (
     {"commands"},
 )
 
-# The frameworks and programs that only one row, or one file, may import.
+# The rows or files that may import a framework.
 CONFINED = {
     "mujoco": {"simulation", "viewing"},
     "OpenGL": {"simulation"},
@@ -60,8 +62,7 @@ HEAVY = (
     *("h5py", "imageio", "ray", "submitit", "viser", "mjviser", "trimesh"),
 )
 
-
-# Each module's dotted name below the package, and its file.
+# Paths by dotted name below the package.
 MODULES = {
     ".".join(part for part in parts if part != "__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
@@ -71,7 +72,7 @@ MODULES = {
 
 
 def imports(name, path):
-    """Yield what a module imports, ours as `mjrec.<name>`, also inside functions."""
+    """Yield the imports of a module, also inside functions, as absolute names."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -88,7 +89,7 @@ def imports(name, path):
 
 
 def _imported_by_call(call, package):
-    """Yield what a call like `import_module("..a.b", __package__)` imports."""
+    """Yield the import of a call like `import_module("..a.b", __package__)`."""
     function = ast.unparse(call.func).rpartition(".")[2]
     first = call.args[0] if call.args else None
     if function == "import_module" and isinstance(first, ast.Constant):
@@ -98,11 +99,9 @@ def _imported_by_call(call, package):
 
 
 def row(name):
-    """Return the number of the row that a module belongs to."""
     return next(i for i, names in enumerate(ROWS) if name.split(".")[0] in names)
 
 
-# What each module imports, ours without `mjrec.`.
 IMPORTED = {name: {*imports(name, path)} for name, path in MODULES.items()}
 OURS = {
     name: {each.removeprefix("mjrec.") for each in all_ if each.startswith("mjrec.")}
@@ -111,14 +110,11 @@ OURS = {
 
 
 def test_modules_import_only_from_rows_below():
-    """The layers of the design hold; every module has a row."""
-    assert [
-        (name, each) for name in OURS for each in OURS[name] if row(each) > row(name)
-    ] == []
+    pairs = [(name, each) for name in OURS for each in OURS[name]]
+    assert [(name, each) for name, each in pairs if row(each) > row(name)] == []
 
 
 def test_frameworks_stay_in_their_rows():
-    """Only the row that is for a framework imports it."""
     assert [
         (name, imported)
         for name in IMPORTED
@@ -129,7 +125,6 @@ def test_frameworks_stay_in_their_rows():
 
 
 def test_all_names_exist_and_are_sorted():
-    """`__all__` is the public surface, and each name can be had; so can the version."""
     assert mjrec.__all__ == sorted(mjrec.__all__)
     for name in mjrec.__all__:
         assert getattr(mjrec, name) is not None
@@ -139,21 +134,17 @@ def test_all_names_exist_and_are_sorted():
         _ = mjrec.no_such_name
 
 
-def test_every_error_is_public_and_an_error():
-    """The subclasses of Error are names of the package."""
+def test_every_error_is_public_and_in_the_error_tree():
     assert {"Error", "InvalidFrame", "UntrustedModel"} <= errors.KINDS.keys()
-    drawn = errors.__doc__ or ""
+    tree = errors.__doc__ or ""
     for name, kind in errors.KINDS.items():
         assert name in mjrec.__all__
         assert getattr(mjrec, name) is kind
-        assert name in drawn
+        assert name in tree
 
 
 def test_import_is_inert():
-    """No simulator, no OpenGL, no ffmpeg, and the environment stays as it is.
-
-    Nor does a monitor load HDF5: trajectories are logs while an environment runs.
-    """
+    """It loads no simulator, OpenGL or ffmpeg; a monitor loads no HDF5."""
     assert run_python(
         "import os, sys; before = dict(os.environ); import mjrec; "
         f"print([m for m in {HEAVY} if m in sys.modules], before == os.environ); "
@@ -161,8 +152,7 @@ def test_import_is_inert():
     ).stdout.split() == ["[]", "True", "False"]
 
 
-def test_read_half_needs_no_simulator():
-    """Results are read on a machine without mujoco, OpenGL or ffmpeg."""
+def test_reading_results_needs_no_simulator():
     assert run_python(
         "import sys; "
         f"sys.modules.update(dict.fromkeys({HEAVY})); "
@@ -172,16 +162,13 @@ def test_read_half_needs_no_simulator():
 
 
 def test_no_module_hides_a_public_name():
-    """After every submodule was imported, every public name is still what it was."""
-    # In a process of its own: here, anything may have been imported before. Modules
-    # first, because a name that was used once stays.
+    """A submodule's name would replace the public name when it is imported."""
     assert run_python(
         "import contextlib, importlib, importlib.util, pkgutil, types, mjrec\n"
         "lacks = not importlib.util.find_spec('dm_control')\n"
         "missing = (ModuleNotFoundError, mjrec.MissingDependency) * lacks\n"
         "for module in pkgutil.walk_packages(mjrec.__path__, 'mjrec.'):\n"
         "    if module.name != 'mjrec.__main__':\n"
-        # Without the extras there is nothing of theirs to hide a name.
         "        with contextlib.suppress(*missing):\n"
         "            importlib.import_module(module.name)\n"
         "names = {name: getattr(mjrec, name) for name in mjrec.__all__}\n"

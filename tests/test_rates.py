@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Exact frame rates."""
+
 from fractions import Fraction
 
 import numpy as np
@@ -20,28 +22,26 @@ from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, stride_for, to_rate
         (rate_from_timestep(1 / 60), Fraction(60)),
     ],
 )
-def test_rate_is_the_fraction_that_was_meant(found, rate):
-    """Numbers of every kind, and sums of them, are taken for what decimals say."""
+def test_rate_is_an_exact_fraction(found, rate):
+    """Numbers of every kind, and sums of them, become the fraction that they mean."""
     assert found == rate
 
 
 @pytest.mark.parametrize("fps", [0, -1, float("nan"), True, "30", 1e-9, 1e9])
-def test_impossible_rate_is_an_error(fps):
-    """What is no number of frames a second is named."""
+def test_invalid_rate_is_an_error(fps):
     with pytest.raises(InvalidArgument, match="fps must be"):
         to_rate(fps)
 
 
 @pytest.mark.parametrize("timestep", [0.0, -0.1, float("nan"), 4e-7, 5e-324])
-def test_impossible_timestep_is_an_error(timestep):
-    """Time goes forward."""
+def test_invalid_timestep_is_an_error(timestep):
     with pytest.raises(InvalidArgument, match="timestep"):
         rate_from_timestep(timestep)
 
 
 @pytest.mark.parametrize("timestep", [1.234567, 1e-6, 12.3456789])
 def test_rate_of_any_timestep_fits_a_video_file(timestep):
-    """Both terms are at most a million, and the rate is right to a millionth."""
+    """Both terms are at most a million; the error is at most a millionth."""
     rate = rate_from_timestep(timestep)
     assert max(rate.numerator, rate.denominator) <= MAX_DENOMINATOR
     assert float(rate) * timestep == pytest.approx(1, rel=1e-6)
@@ -52,5 +52,4 @@ def test_rate_of_any_timestep_fits_a_video_file(timestep):
     [(20, None, 1), (20, 60, 1), (125, 25, 5), (125, Fraction(249, 10), 6)],
 )
 def test_stride_is_the_smallest_that_fits(rate, max_fps, stride):
-    """Every step, every second, every third ..."""
     assert stride_for(Fraction(rate), max_fps) == stride

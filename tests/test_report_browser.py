@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a report in a real browser: headless Chromium, driven by Playwright."""
+"""Report pages in headless Chromium, driven by Playwright."""
 
 import contextlib
 import re
@@ -31,14 +31,13 @@ def browser():
 
 @pytest.fixture
 def page(browser):
-    """A page of a usual size."""
     with page_of_width(browser, 1280) as page:
         yield page
 
 
 @contextlib.contextmanager
 def page_of_width(browser, width, **options):
-    """Have a page that must neither complain nor ask for anything but files."""
+    """Open a page that must log no errors and request only files."""
     size = {"width": width, "height": 900}
     with browser.new_context(viewport=size, **options) as context:
         page = context.new_page()
@@ -51,7 +50,6 @@ def page_of_width(browser, width, **options):
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory):
-    """Make a folder of two short videos."""
     folder = tmp_path_factory.mktemp("report #1")
     frames = np.tile(np.arange(64, dtype=np.uint8)[:, None], (FRAMES, 48, 1, 3))
     for name in ("best", "worst"):
@@ -61,43 +59,38 @@ def videos(tmp_path_factory):
     return folder
 
 
-def usual_report():
-    """Return two tasks of fifty episodes, and the best and the worst of each."""
-    made = contents(problems=["b"])
-    for of in made.tasks:
-        order = np.argsort(of.episodes["total_reward"]).tolist()
-        of.videos = [
+def benchmark_report():
+    """Return two tasks of fifty episodes with their best and worst videos."""
+    report = contents(problems=["b"])
+    for each in report.tasks:
+        order = np.argsort(each.episodes["total_reward"]).tolist()
+        each.videos = [
             video(episode, file=f"{role}-episode-0.mp4", poster="", roles=(role,))
             for role, episode in (("best", order[-1]), ("worst", order[0]))
         ]
-    made.verdicts.append(
+    report.verdicts.append(
         Verdict(source="run", verdict="PARTLY", counts={"believed": 3}, level="pixels")
     )
-    return made
+    return report
 
 
 def open_report(page, folder, report):
-    """Write a report into a folder, and open it from there."""
     file = folder / "index.html"
     file.write_text(page_of(report), encoding="utf-8")
     page.goto(file.as_uri())
 
 
 @pytest.fixture
-def usual(page, videos):
-    """Open the usual report."""
-    open_report(page, videos, usual_report())
+def benchmark(page, videos):
+    open_report(page, videos, benchmark_report())
     return page
 
 
-# --- Videos -----------------------------------------------------------------------
-
-
-def test_videos_play(usual):
-    """Each at its size and for its time, one at a time, and by keyboard."""
-    players = usual.locator("video")
+def test_videos_play(benchmark):
+    """Only one plays at a time."""
+    players = benchmark.locator("video")
     expect(players).to_have_count(0)
-    buttons = usual.get_by_role("button", name="Play dm_control/")
+    buttons = benchmark.get_by_role("button", name="Play dm_control/")
     expect(buttons).to_have_count(4)
     for i, start in enumerate(("click", "Enter", "Space", "click")):
         button = buttons.first
@@ -105,23 +98,22 @@ def test_videos_play(usual):
         player = players.nth(i)
         expect(player).to_be_focused()
         expect(player).to_have_accessible_name(re.compile(r"^dm_control/\S+, seed"))
-        usual.wait_for_function(
+        benchmark.wait_for_function(
             "i => document.querySelectorAll('video')[i].currentTime > 0.1", arg=i
         )
-        told = player.evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
-        assert told == [64, 48, pytest.approx(FRAMES / FPS, abs=1 / FPS)]
+        facts = player.evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
+        assert facts == [64, 48, pytest.approx(FRAMES / FPS, abs=1 / FPS)]
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
-    assert usual.evaluate(playing) <= 1
+    assert benchmark.evaluate(playing) <= 1
 
 
 @parametrize("single_file", [False, True])
-def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_file):
-    """From the monitor's files to the frame in the browser."""
+def test_report_of_a_recording_plays(page, tmp_path, make_corridor, play, single_file):
+    """The recording itself is deleted first."""
     directory = tmp_path / "recordings #1"
     with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
         play(monitor, 3, seed=0)
     index = write_report(directory, tmp_path / "a report", single_file=single_file)
-    # The folder is whole by itself.
     shutil.rmtree(directory)
     page.goto(index.resolve().as_uri())
     expect(page.locator("#summary-table tbody tr")).to_have_count(1)
@@ -129,17 +121,14 @@ def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_f
     page.get_by_role("button", name="Play").first.click()
     player = page.locator("video").first
     page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
-    # The environment's own rate is 10, and the first frame is the reset's.
+    # The reset's frame and 20 steps, at the environment's 10 frames a second.
     assert player.evaluate("v => v.duration") == pytest.approx(2.1, abs=0.1)
     assert player.evaluate("v => v.poster") != ""
 
 
-# --- Sorting and filtering --------------------------------------------------------
-
-
 @pytest.mark.thorough
-def test_tables_sort_by_mouse_and_by_keyboard(page, tmp_path):
-    """Either way, and say which; what is not known comes last whichever way."""
+def test_tables_sort_by_mouse_and_keyboard(page, tmp_path):
+    """Unknown values come last in either direction."""
     unknown = task("c", [2.0], failures={0: "x"})
     known = task("a", [3.0, 3.0]), task("b", [1.0])
     open_report(page, tmp_path, contents(*known, unknown))
@@ -156,52 +145,49 @@ def test_tables_sort_by_mouse_and_by_keyboard(page, tmp_path):
 
 
 @pytest.mark.thorough
-def test_the_gallery_filters_by_mouse_and_by_keyboard(usual):
-    """By task, by best or worst, and by both; the table finds what it has hidden."""
+def test_gallery_filters_by_mouse_and_keyboard(benchmark):
+    """A link in the episode table shows a hidden video again."""
 
     def shown():
-        cards = usual.locator(".card:not([hidden])").all()
+        cards = benchmark.locator(".card:not([hidden])").all()
         return [card.get_attribute("id") for card in cards]
 
-    usual.get_by_role("radio", name="Worst").click()
+    benchmark.get_by_role("radio", name="Worst").click()
     assert shown() == ["video-1", "video-3"]
-    expect(usual.locator("#gallery-count")).to_have_text("2 of 4 videos")
-    usual.locator("#gallery-task").select_option(label="dm_control/cheetah-run")
+    expect(benchmark.locator("#gallery-count")).to_have_text("2 of 4 videos")
+    benchmark.locator("#gallery-task").select_option(label="dm_control/cheetah-run")
     assert shown() == ["video-3"]
-    usual.get_by_role("radio", name="Worst").press("ArrowLeft")
-    expect(usual.get_by_role("radio", name="Best")).to_be_checked()
+    benchmark.get_by_role("radio", name="Worst").press("ArrowLeft")
+    expect(benchmark.get_by_role("radio", name="Best")).to_be_checked()
     assert shown() == ["video-2"]
-    usual.locator("#episodes-table").get_by_role("button", name="Return").click()
-    usual.locator("#episodes-table tbody a").first.click()
-    expect(usual.locator("#video-0")).to_be_in_viewport()
-    assert usual.url.endswith("#video-0")
+    benchmark.locator("#episodes-table").get_by_role("button", name="Return").click()
+    benchmark.locator("#episodes-table tbody a").first.click()
+    expect(benchmark.locator("#video-0")).to_be_in_viewport()
+    assert benchmark.url.endswith("#video-0")
 
 
 @pytest.mark.thorough
-def test_a_command_is_copied_or_selected(usual):
-    """Whatever the browser allows to a page from the disk."""
-    card = usual.locator("#video-0")
+def test_command_is_copied_or_selected(benchmark):
+    """A browser may refuse the clipboard to local files."""
+    card = benchmark.locator("#video-0")
     card.get_by_text("File, hash and command").click()
-    command, of_hash = (
-        card.get_by_role("button", name=f"Copy the {what}")
-        for what in ("command", "hash")
-    )
+    command = card.get_by_role("button", name="Copy the command")
+    sha256 = card.get_by_role("button", name="Copy the hash")
     command.click()
     expect(command).to_have_text("Copied")
-    usual.evaluate(
+    benchmark.evaluate(
         """() => {
             navigator.clipboard.writeText = () => Promise.reject(new Error("no"));
             document.execCommand = () => false;
         }"""
     )
-    of_hash.click()
-    expect(of_hash).to_have_text("Selected")
-    assert usual.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
+    sha256.click()
+    expect(sha256).to_have_text("Selected")
+    assert benchmark.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
 
 
 @pytest.mark.thorough
-def test_of_ten_thousand_episodes_a_hundred_are_laid_out(page, tmp_path):
-    """Opening, sorting, filtering and turning pages cost no more than what is shown."""
+def test_large_tables_show_a_hundred_rows_a_page(page, tmp_path):
     shown = [video(i, file=f"{i}.mp4", poster="") for i in range(20)]
     tasks = [task(name, np.arange(2000.0), videos=shown) for name in "abcde"]
     open_report(page, tmp_path, contents(*tasks, task("short", np.arange(152.0))))
@@ -222,15 +208,12 @@ def test_of_ten_thousand_episodes_a_hundred_are_laid_out(page, tmp_path):
     assert cells[:5] == ["short", "truncated", "0", "151", "151.0"]
 
 
-# --- For everybody ----------------------------------------------------------------
-
-
 @pytest.mark.axe
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("report", [usual_report, hostile_report])
-def test_nothing_keeps_people_out(browser, videos, width, scheme, report):
-    """axe-core finds nothing serious, and a phone scrolls in one direction only."""
+@pytest.mark.parametrize("report", [benchmark_report, hostile_report])
+def test_page_is_accessible(browser, videos, width, scheme, report):
+    """axe-core finds no serious barrier; phones need no horizontal scrolling."""
     with page_of_width(browser, width, color_scheme=scheme) as page:
         open_report(page, videos, report())
         page.evaluate(
@@ -241,11 +224,11 @@ def test_nothing_keeps_people_out(browser, videos, width, scheme, report):
 
 
 @pytest.mark.thorough
-def test_paper_has_the_whole_summary_frames_and_no_buttons(browser, videos):
-    """On A4 with margins of a centimetre."""
+def test_printed_page_has_all_frames_and_no_buttons(browser, videos):
+    """The width is that of A4 with margins of one centimeter."""
     with page_of_width(browser, 718) as page:
         page.emulate_media(media="print")
-        open_report(page, videos, usual_report())
+        open_report(page, videos, benchmark_report())
         assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
         expect(page.locator("#gallery-filter")).to_be_hidden()
         expect(page.locator("nav")).to_be_hidden()
@@ -255,8 +238,8 @@ def test_paper_has_the_whole_summary_frames_and_no_buttons(browser, videos):
         assert frame.evaluate(f"e => {signs}") == ["none", "none"]
 
 
-def test_what_a_stranger_wrote_stays_text(page, browser, videos):
-    """Markup is read, not run; no script would run even if some came through."""
+def test_hostile_text_stays_text(page, browser, videos):
+    """The page's policy would block injected scripts as well."""
     open_report(page, videos, hostile_report())
     assert page.title() == HOSTILE[0]
     expect(page.locator("h1")).to_have_text(HOSTILE[0])
@@ -265,10 +248,10 @@ def test_what_a_stranger_wrote_stays_text(page, browser, videos):
     assert page.locator("img[onerror]").count() == 0
     assert page.locator("img").count() == len(HOSTILE)
     assert page.locator("script").count() == 2
-    # The policy complains of what it stops.
+    # A page without the check, because the policy logs an error.
     with browser.new_context() as context:
         page = context.new_page()
-        open_report(page, videos, usual_report())
+        open_report(page, videos, benchmark_report())
         page.evaluate(
             """document.body.append(Object.assign(
                 document.createElement("script"), {textContent: "hasRun = true"}))"""
@@ -277,11 +260,10 @@ def test_what_a_stranger_wrote_stays_text(page, browser, videos):
 
 
 @pytest.mark.thorough
-def test_without_scripts_everything_but_the_tools_is_there(browser, videos):
-    """And the page says what is missing."""
+def test_page_without_scripts_lacks_only_its_tools(browser, videos):
     with browser.new_context(java_script_enabled=False) as context:
         page = context.new_page()
-        open_report(page, videos, usual_report())
+        open_report(page, videos, benchmark_report())
         links = page.get_by_role("link", name="Play dm_control/")
         expect(links).to_have_count(4)
         assert (links.first.get_attribute("href") or "").endswith(".mp4")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A report is a folder that stands on its own, or one file."""
+"""Reports as a folder that needs nothing else, or as one file."""
 
 import base64
 import hashlib
@@ -25,7 +25,6 @@ from report_recordings import GYM, entry, record, write_journal
 
 @pytest.fixture
 def recordings(corridor, tmp_path):
-    """Two episodes with a video each."""
     directory = tmp_path / "recordings"
     record(corridor, directory, 2)
     return directory
@@ -41,16 +40,16 @@ def sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_report_is_a_page_with_copies_beside_it(recordings, tmp_path):
-    """It names them, and outlives the recordings; each step is told."""
+def test_report_is_a_page_with_copies_of_media(recordings, tmp_path):
+    """It outlives the recordings; each step is reported."""
     hashes = [sha256(path) for path in sorted(recordings.glob("*.mp4"))]
-    told = []
+    progress = []
     page = write_report(
-        recordings, tmp_path / "report", title="Mine", on_progress=told.append
+        recordings, tmp_path / "report", title="Mine", on_progress=progress.append
     )
     assert page == tmp_path / "report" / "index.html"
     steps = [("posters", 1), ("posters", 2), ("videos", 1), ("videos", 2)]
-    assert told == [ReportProgress(what, done, 2) for what, done in steps]
+    assert progress == [ReportProgress(what, done, 2) for what, done in steps]
     shutil.rmtree(recordings)
     files = [
         f"{kind}/000{number}-unknown-corridor.{ending}"
@@ -66,45 +65,44 @@ def test_a_report_is_a_page_with_copies_beside_it(recordings, tmp_path):
         assert words in text
 
 
-def test_the_command_writes_a_folder_and_prints_its_page(tmp_path, capsys, monkeypatch):
-    """Of several directories, with a verdict; with --json its whole path."""
+def test_command_writes_a_report_of_several_directories(tmp_path, capsys, monkeypatch):
+    """It prints the page's path; `--json` prints it in full."""
     monkeypatch.chdir(tmp_path)
     run = write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)]).parent
-    said = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
-    (tmp_path / "said.json").write_text(json.dumps(said))
+    verdict = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
+    (tmp_path / "verdict.json").write_text(json.dumps(verdict))
     page = tmp_path / "r" / "index.html"
     directories = (run, GYM / "0.7.4" / "plain")
-    options = {"title": "Both", "verification": (tmp_path / "said.json",)}
+    options = {"title": "Both", "verification": (tmp_path / "verdict.json",)}
     assert report(directories, out=page.parent, **options) == 0
     assert capsys.readouterr().out == f"{page}\n"
     text = page.read_text()
-    for words in ("<title>Both</title>", "X-v0", "Tiny-v0", "said.json"):
+    for words in ("<title>Both</title>", "X-v0", "Tiny-v0", "verdict.json"):
         assert words in text
     assert report((run,), as_json=True) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == {"page": str(tmp_path / "report" / "index.html")}
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"page": str(tmp_path / "report" / "index.html")}
     with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
         report((run,), out=page, single_file=True, max_single_file_bytes=10)
 
 
-def test_posters_show_the_middle(recordings):
-    """At most 640 pixels wide, with the colours of the video."""
+def test_posters_show_the_middle_frame(recordings):
     sizes = [(400, 800), (48, 64)]
     for video, size in zip(sorted(recordings.glob("*.mp4")), sizes, strict=True):
         with mjrec.VideoWriter(video, fps=10) as writer:
-            for colour in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
-                writer.write(np.full((*size, 3), colour, np.uint8))
+            for color in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
+                writer.write(np.full((*size, 3), color, np.uint8))
     contents = gather(recordings)
     add_images(contents, lambda progress: None)
-    shown = [Image.open(io.BytesIO(video.image)) for video in contents.videos]
-    assert [image.size for image in shown] == [(640, 320), (64, 48)]
-    for image in shown:
+    posters = [Image.open(io.BytesIO(video.image)) for video in contents.videos]
+    assert [image.size for image in posters] == [(640, 320), (64, 48)]
+    for image in posters:
         assert image.format == "JPEG"
         np.testing.assert_allclose(image.getpixel((20, 20)), (20, 160, 90), atol=4)
 
 
-def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_path):
-    """One that was cut off is copied; a page, which a browser would open, is not."""
+def test_invalid_videos_are_named(recordings, tmp_path):
+    """A truncated video is copied; an HTML file with a video's name is not."""
     first, second = sorted(recordings.glob("*.mp4"))
     first.write_bytes(first.read_bytes()[:200])
     second.write_text("<html><script>alert(1)</script></html>")
@@ -117,8 +115,7 @@ def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_pat
     assert f"The video {second} is left out" in text
 
 
-def test_hostile_names_are_text_on_the_page_and_no_names_of_files(tmp_path):
-    """Whatever an environment is called."""
+def test_hostile_env_id_is_text_and_no_file_name(tmp_path):
     env_id = "../<script>alert(1)</script>\u202e"
     write_journal(tmp_path / "run", "0.a", env_id, [entry(0)])
     for path in (GYM / "0.22.0" / "text").glob("*.video000000*.json"):
@@ -130,51 +127,9 @@ def test_hostile_names_are_text_on_the_page_and_no_names_of_files(tmp_path):
     assert "<script>alert" not in page.read_text()
 
 
-def test_a_report_replaces_a_report(recordings, tmp_path):
-    """And an empty folder; nothing of the older one, or of the making, is left."""
+def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
+    """A report that fails leaves the older one."""
     (tmp_path / "report").mkdir()
-    write_report(recordings, tmp_path / "report")
-    run = tmp_path / "run"
-    run.mkdir()
-    # Nothing but a damaged file: there is a page all the same, which names it.
-    (run / "openaigym.manifest.1.b.manifest.json").write_text("{")
-    page = write_report(run, tmp_path / "report")
-    assert names(tmp_path / "report") == ["index.html"]
-    assert "openaigym.manifest.1.b.manifest.json" in page.read_text()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report", "run"]
-
-
-@pytest.mark.parametrize(
-    ("target", "mine", "options", "words"),
-    [
-        # Another folder, and a report that somebody has put something into.
-        ("other", "other/index.html", {}, "index.html"),
-        ("report", "report/videos/mine.mp4", {}, "videos/mine.mp4"),
-        ("report", "report/notes.txt", {}, "notes.txt"),
-        # Whoever names the same directory twice keeps it.
-        ("recordings", "recordings/notes.txt", {}, "belong to a report"),
-        ("mine.html", "mine.html", {"single_file": True}, "is not a report"),
-        ("mine.html", "mine.html", {}, "single_file"),
-        ("file", "file", {}, "is a file"),
-        ("file/report", "file", {}, "file"),
-    ],
-)
-def test_what_is_no_report_is_not_replaced(
-    recordings, tmp_path, target, mine, options, words
-):
-    """All stays as it was, and the error names what is in the way."""
-    write_report(recordings, tmp_path / "report")
-    (tmp_path / mine).parent.mkdir(exist_ok=True)
-    (tmp_path / mine).write_text("mine")
-    before = names(tmp_path)
-    with pytest.raises((InvalidArgument, DirectoryNotWritable), match=words):
-        write_report(recordings, tmp_path / target, **options)
-    assert names(tmp_path) == before
-    assert (tmp_path / mine).read_text() == "mine"
-
-
-def test_a_failed_report_leaves_what_was_there(recordings, tmp_path):
-    """And nothing half-written."""
     page = write_report(recordings, tmp_path / "report")
     before = page.read_text()
 
@@ -186,53 +141,86 @@ def test_a_failed_report_leaves_what_was_there(recordings, tmp_path):
         write_report(recordings, tmp_path / "report", title="2", on_progress=stop)
     assert page.read_text() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
+    run = tmp_path / "run"
+    run.mkdir()
+    # A directory with only a damaged file still has a report.
+    (run / "openaigym.manifest.1.b.manifest.json").write_text("{")
+    page = write_report(run, tmp_path / "report")
+    assert names(tmp_path / "report") == ["index.html"]
+    assert "openaigym.manifest.1.b.manifest.json" in page.read_text()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report", "run"]
+
+
+@pytest.mark.parametrize(
+    ("target", "mine", "options", "words"),
+    [
+        ("other", "other/index.html", {}, "index.html"),
+        # Reports with added files.
+        ("report", "report/videos/mine.mp4", {}, "videos/mine.mp4"),
+        ("report", "report/notes.txt", {}, "notes.txt"),
+        ("recordings", "recordings/notes.txt", {}, "belong to a report"),
+        ("mine.html", "mine.html", {"single_file": True}, "is not a report"),
+        ("mine.html", "mine.html", {}, "single_file"),
+        ("file", "file", {}, "is a file"),
+        ("file/report", "file", {}, "file"),
+    ],
+)
+def test_other_files_are_not_replaced(
+    recordings, tmp_path, target, mine, options, words
+):
+    write_report(recordings, tmp_path / "report")
+    (tmp_path / mine).parent.mkdir(exist_ok=True)
+    (tmp_path / mine).write_text("mine")
+    before = names(tmp_path)
+    with pytest.raises((InvalidArgument, DirectoryNotWritable), match=words):
+        write_report(recordings, tmp_path / target, **options)
+    assert names(tmp_path) == before
+    assert (tmp_path / mine).read_text() == "mine"
 
 
 IMAGE = "<img[^>]* src=.data:image/jpeg;base64,"
 VIDEO = "<a [^>]*href=.data:video/mp4;base64,"
 
 
-def test_a_single_file_has_as_much_in_it_as_is_allowed(recordings, tmp_path):
-    """Byte for byte; posters come first, then the videos; what is missing is told."""
+def test_single_file_embeds_media_up_to_its_limit(recordings, tmp_path):
+    """Posters come first; the page counts missing videos."""
 
-    def written(name, **options):
+    def write(name, **options):
         page = write_report(recordings, tmp_path / name, single_file=True, **options)
         return page, page.read_text()
 
-    # It is replaced as a folder is, and may be in one.
+    # It replaces itself, and may be in a folder.
     for name in ("one.html", "one.html", "folder"):
-        page, text = written(name)
-        # The two are alike, and each is there once.
+        page, text = write(name)
+        # Both videos are equal.
         for path in recordings.glob("*.mp4"):
             assert text.count(base64.b64encode(path.read_bytes()).decode()) == 2
         assert len(re.findall(VIDEO, text)) == len(re.findall(IMAGE, text)) == 2
-        # A link saves a video, for no browser opens a page that is such an address.
+        # Browsers do not open pages at data addresses, so links download.
         assert all("download" in link for link in re.findall(VIDEO + "[^>]*", text))
     assert names(tmp_path / "folder") == ["index.html"]
     most = page.stat().st_size - 100
-    part, text = written("part.html", max_single_file_bytes=most)
+    part, text = write("part.html", max_single_file_bytes=most)
     assert part.stat().st_size <= most
     assert (len(re.findall(IMAGE, text)), len(re.findall(VIDEO, text))) == (2, 1)
     assert "1 of 2 videos are not embedded" in text
     with pytest.raises(InvalidArgument, match="without any image or video"):
-        written("tiny.html", max_single_file_bytes=1000)
+        write("tiny.html", max_single_file_bytes=1000)
     assert not (tmp_path / "tiny.html").exists()
 
 
-def test_replays_stand_beside_the_videos(tmp_path):
-    """With `--replay` the best, median and worst episode have a page in 3D each."""
+def test_replay_option_adds_three_pages_in_3d(tmp_path):
+    """They show the best, median and worst episode."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
-    always = {"video_callable": lambda _: True}
-    record(env, tmp_path / "run", 4, height=48, width=64, **always)
+    record(env, tmp_path / "run", 4, height=48, width=64, video_callable=lambda _: True)
     page = tmp_path / "report/index.html"
-    assert (
-        main(["report", str(tmp_path / "run"), "--replay", "-o", str(page.parent)]) == 0
-    )
+    command = ["report", str(tmp_path / "run"), "--replay", "-o", str(page.parent)]
+    assert main(command) == 0
     links = re.findall(r'href="\./(replays/[^"]+)"', page.read_text())
     assert len(set(links)) == 3
     assert all("replay-data" in (page.parent / each).read_text() for each in links)
-    # It is still a report, which another one replaces.
+    # Another report replaces it.
     write_report(tmp_path / "run", tmp_path / "report")
     assert not (tmp_path / "report" / "replays").exists()
     with pytest.raises(InvalidArgument, match="Replays are separate pages"):

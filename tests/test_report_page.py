@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The text of a report's page, and its figures; `test_report_browser` opens it."""
+"""The text and figures of report pages; `test_report_browser` opens them."""
 
 import json
 import re
@@ -20,8 +20,6 @@ from mjrec.reporting.page_text import number
 
 
 class Elements(HTMLParser):
-    """What a page consists of."""
-
     def __init__(self, page):
         super().__init__()
         self.found = []
@@ -38,23 +36,19 @@ class Elements(HTMLParser):
 
 
 def data_of(page):
-    """Return what the page's script reads."""
+    """Return the data of the page's script."""
     found = re.search(r'id="episodes-data">(.*?)</script>', page, re.DOTALL)
     return json.loads(found[1])
 
 
 def page_with(*videos):
-    """Return the page of the usual report, whose first task has these videos."""
-    made = contents()
-    made.tasks[0].videos = videos
-    return page_of(made)
+    report = contents()
+    report.tasks[0].videos = videos
+    return page_of(report)
 
 
-# --- Texts of strangers -----------------------------------------------------------
-
-
-def test_texts_of_strangers_stay_text():
-    """There are no elements, handlers or styles but the page's own, nothing unseen."""
+def test_hostile_text_stays_text():
+    """It adds no element, handler, style or invisible character."""
     page = page_of(hostile_report())
     elements = Elements(page)
     assert len(elements.named("script")) == 2
@@ -65,7 +59,7 @@ def test_texts_of_strangers_stay_text():
     assert not [name for name in attributes if name[:2] == "on" or name == "style"]
     assert not set("\u202e\u2028\x00\x1b") & set(page)
     assert r"abc\u202edef\u2028ghi" in page
-    # Every address is of a file beside the page, or a place on it.
+    # All addresses name files beside the page or places on it.
     addresses = [
         found[name]
         for _, found in elements.found
@@ -75,19 +69,13 @@ def test_texts_of_strangers_stay_text():
     assert addresses
     assert all(re.match(r"\./|#|data:,$", address or "") for address in addresses)
     assert not re.search(r"https?://|url\(", page)
-    # Long texts are cut, so that a page of them can be read.
-    assert not re.search("x{1001}", page.split('id="videos"')[0])
-    # No name ends the element that the script reads.
+    assert not re.search("x{1001}", page.split('id="videos"')[0])  # long text is cut
     assert data_of(page)["tasks"][1]["name"] == HOSTILE[1]
 
 
-# --- What it shows ----------------------------------------------------------------
-
-
-def test_a_card_says_what_a_video_shows():
-    """Its episode, its size, how it is made again, and by which rule it was chosen."""
-    made = video(12, notes=["Chosen by best:2, median."])
-    page = page_with(made)
+def test_video_card_shows_episode_size_command_and_rule():
+    best = video(12, notes=["Chosen by best:2, median."])
+    page = page_with(best)
     (image,) = Elements(page).named("img")
     assert (image["width"], image["height"]) == ("64", "48")
     assert image["src"] == "./videos/a%20b.png"
@@ -96,25 +84,24 @@ def test_a_card_says_what_a_video_shows():
         "best, median and worst",
         "Play <bdi>dm_control/walker-walk, seed 1, episode 2, side</bdi>",
         *("15 steps", "truncated", "2.0 s", "Chosen by best:2, median."),
-        *(made.sha256, made.command),
+        *(best.sha256, best.command),
     ):
         assert words in gallery
-    # A page is known by its mark, and may then be replaced; it is the same each time.
+    # This mark allows a later report to replace the page.
     mark = {"name": "generator", "content": f"mjrec {version('mjrec')}"}
     assert mark in Elements(page).named("meta")
-    assert page == page_with(made)
-    # A video that is no part of the report has no player.
-    page = page_with(replace(made, file=""))
+    assert page == page_with(best)
+    # A video outside the report has no player.
+    page = page_with(replace(best, file=""))
     assert Elements(page).players() == []
     assert "./videos/a%20b.png" in page
-    assert made.command in page
+    assert best.command in page
 
 
-def test_what_the_figures_do_not_say_is_said_beside_them():
-    """How most were made, which are missing or made otherwise, and what differs."""
-    usual = [("GL", "llvmpipe"), ("Policy", "p")]
+def test_notes_explain_missing_and_different_figures():
+    shared = [("GL", "llvmpipe"), ("Policy", "p")]
     first, second, odd, large = (
-        task(name, returns, provenance=[*usual, ("Seeds", name)])
+        task(name, returns, provenance=[*shared, ("Seeds", name)])
         for name, returns in (
             ("a", [1.0, 2.0, 4.5]),
             *(("b", [1.0, 2.0, 3.0]), ("odd", [1.0]), ("large", [7.0, 8.0])),
@@ -125,8 +112,8 @@ def test_what_the_figures_do_not_say_is_said_beside_them():
     large.summary = replace(large.summary, interval_method=method)
     scores = AcrossTasks(tasks=("a",), left_out={"b": "no episode was completed"})
     page = page_of(contents(first, second, large, odd, across={"one": scores}))
-    [said] = re.findall(r"intervals of 95%: ([^.]*)\.", page)
-    assert said.endswith("50 resamples, seed 0")
+    [note] = re.findall(r"intervals of 95%: ([^.]*)\.", page)
+    assert note.endswith("50 resamples, seed 0")
     notes = re.findall(r"<li><span[^>]*>(\w+)</span>: ([^<]*)\.</li>", page)
     assert notes == [
         ("large", f"Intervals by a different method, {method}"),
@@ -134,49 +121,44 @@ def test_what_the_figures_do_not_say_is_said_beside_them():
     ]
     assert "<summary>1 left out</summary>" in page
     assert ">b</span>: no episode was completed</li>" in page
-    # The standard deviation has n - 1; of one episode there is none.
+    # The standard deviation divides by n - 1; one episode has none.
     body = page.split('<table id="summary-table">')[1].split("</table>")[0]
     assert ">1.803</td>" in body
     assert 'data-value="">\N{EN DASH}</td>' in body
-    # What is the same for all tasks is said once.
+    # Facts that all tasks share appear once.
     assert page.count("llvmpipe") == 1
     assert page.count("<dt>Seeds</dt>") == 4
 
 
-def test_a_page_opens_with_a_part_of_many_episodes():
-    """Those with videos, failures, the best and the worst; players for some videos."""
+def test_page_of_many_episodes_holds_a_selection():
+    """It takes videos, failures, best and worst; some videos have players."""
     returns = np.arange(30_000.0)
-    # Those of any size are told; one that is no number is not.
     returns[:3] = (-1e307, 0.123456789, 1e307)
-    made = task("a", returns, failures={17_000: "boom"}, score_range=None)
-    made.videos = [
+    large = task("a", returns, failures={17_000: "boom"}, score_range=None)
+    large.videos = [
         video(15_000 + i, file=f"{i}.mp4", roles=("best",) if i == 599 else ())
         for i in range(600)
     ]
-    page = page_of(contents(made, across={}))
-    (shown,) = data_of(page)["tasks"]
-    assert len(shown["run"]) < 20_000
-    rewards = dict(zip(shown["episode"], shown["total_reward"], strict=True))
+    page = page_of(contents(large, across={}))
+    (listed,) = data_of(page)["tasks"]
+    assert len(listed["run"]) < 20_000
+    rewards = dict(zip(listed["episode"], listed["total_reward"], strict=True))
     assert (rewards[0], rewards[2], rewards[17_000]) == (-1e307, 1e307, None)
     assert "evaluation/results.csv" in page
     assert "30\u202f000" in page
-    # The table of episodes links to the videos that have no player.
+    # The table links to the files of other videos.
     assert len(Elements(page).players()) == 300
     places = [
-        shown["videos"][str(shown["episode"].index(15_000 + i))] for i in (599, 598)
+        listed["videos"][str(listed["episode"].index(15_000 + i))] for i in (599, 598)
     ]
     assert places == [["#video-599"], ["./598.mp4"]]
 
 
-def test_a_report_of_nothing_is_a_page():
-    """So is one of a task without a completed episode; neither has figures."""
+def test_report_without_episodes_is_a_page_without_figures():
     assert "0 tasks, 0 episodes, 0 videos" in page_of(ReportContents())
     page = page_of(contents(task("a", [1.0], failures={0: "PolicyError: NaN"})))
     assert "PolicyError: NaN" in page
     assert 'class="curve"' not in page
-
-
-# --- Figures ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("draw", [learning_curve, evaluation_curve])
@@ -189,7 +171,6 @@ def test_a_report_of_nothing_is_a_page():
     ids=len,
 )
 def test_any_returns_make_a_small_figure(draw, returns):
-    """However many there are, equal or extreme; every coordinate is a number."""
     for seeds in (1, min(100, len(returns))):
         svg = draw(task("a", returns, seeds=seeds, score_range=None), key="k")
         assert len(svg) < 40_000
@@ -199,8 +180,7 @@ def test_any_returns_make_a_small_figure(draw, returns):
         assert not re.search("nan|inf", "".join(paths))
 
 
-def test_a_learning_curve_is_in_the_order_of_time():
-    """Several monitors write side by side."""
+def test_learning_curve_is_ordered_by_time():
     rising = task("a", np.arange(100.0), runs=["0.1"])
     order = np.random.default_rng(0).permutation(100)
     mixed = replace(rising, episodes=rising.episodes[order])
@@ -216,6 +196,5 @@ def test_a_learning_curve_is_in_the_order_of_time():
         (1.5e300, 0, "1.5e+300"),
     ],
 )
-def test_a_number_is_shown_as_people_read_it(value, decimals, shown):
-    """With thousands apart where there are many."""
+def test_numbers_are_readable(value, decimals, shown):
     assert number(value, decimals) == shown

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results are found, merged, listed and cleared as in gym, without its mistakes."""
+"""Find, merge, list and clear results, as gym does."""
 
-import json
 import tracemalloc
 from pathlib import Path
 
@@ -14,17 +13,31 @@ import mjrec
 from mjrec.errors import DirectoryInUse, UnreadableFile
 from mjrec.formats.locks import Lock
 from mjrec.formats.manifest import StatsFile, read_manifest
+from mjrec.formats.monitor_directory import episode_of, infix_of
 from mjrec.reporting.gathering import gather
 
-VIDEO = "openaigym.video.0.1.video000000"
+VIDEO = "openaigym.video.0.1.video000027"
 MONITOR_FILES = [
     "openaigym.episode_batch.0.1.stats.json",
     "openaigym.episodes.0.1.jsonl",
     "openaigym.manifest.0.1.manifest.json",
+    "openaigym.model.0123456789abcdef.zip",
+    "openaigym.results.0.1.monitor.csv",
+    *(f"openaigym.states.0.1.000000.{end}" for end in ("log", "looks", "tail")),
+    "openaigym.trajectory.0.1.episode000027.h5",
     *(f"{VIDEO}.{end}" for end in ("json", "meta.json", "mp4")),
 ]
-HIDDEN_FILES = [".openaigym.0.1.lock", f".{VIDEO}.mp4.01234567.part"]
-OTHER_FILES = ["openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"]
+HIDDEN_FILES = [
+    *(".openaigym.0.1.lock", ".openaigym.manifest.0.1.lock", f".{VIDEO}.lock"),
+    *(".openaigym.clip.0.1.step000000137.lock", ".openaigym.render.3.lock"),
+    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
+    f".{VIDEO}.mp4.01234567.part",
+]
+OTHER_FILES = [
+    *("openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"),
+    *("openaigym.manifest", "openaigym..manifest.json", "openaigym.states.0.1.log"),
+    *("mjrec.evaluation.0.1.jsonl", "openaigym.video.0.1.video27.mp4"),
+]
 
 
 def touch(directory, *names):
@@ -32,12 +45,26 @@ def touch(directory, *names):
         (directory / name).touch()
 
 
-def test_detecting_takes_exact_names_in_order(tmp_path):
-    """Left-overs of gym and others' files are none; `files` stands for the listing."""
+def test_names_give_monitor_and_episode():
+    for name in MONITOR_FILES + HIDDEN_FILES + OTHER_FILES:
+        is_shared = ".model." in name or ".render." in name or name in OTHER_FILES
+        assert infix_of(name) == (None if is_shared else "0.1"), name
+        assert episode_of(name) == (27 if "000027" in name else None), name
+    # Exists only inside logs.
+    assert infix_of("openaigym.clip.0.1.step000000137.part000000") == "0.1"
+
+
+def test_detection_takes_exact_names_in_order(tmp_path):
+    """Links to files count, folders do not; `files` replaces listing the directory."""
     assert mjrec.detect_monitor_files(str(tmp_path / "missing")) == []
     touch(tmp_path, *MONITOR_FILES, *HIDDEN_FILES, *OTHER_FILES)
-    found = [str(tmp_path / name) for name in MONITOR_FILES]
+    (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
+    links = [f"openaigym.manifest.{n}.1.manifest.json" for n in range(2, 6)]
+    for name, target in zip(links, ["policy.pt", "gone", ".", links[3]], strict=True):
+        (tmp_path / name).symlink_to(target)
+    found = [str(tmp_path / name) for name in sorted([*MONITOR_FILES, links[0]])]
     assert mjrec.detect_monitor_files(tmp_path) == found
+    (tmp_path / links[0]).unlink()
     late, early = (f"openaigym.manifest.{i}.manifest.json" for i in ("1.7", "0.7"))
     others = [f"openaigym.manifest.{i}" for i in ("", "0.8.manifest.json~", "0.9.json")]
     (tmp_path / MONITOR_FILES[2]).unlink()
@@ -48,9 +75,9 @@ def test_detecting_takes_exact_names_in_order(tmp_path):
     assert named == [str(tmp_path / "x" / early), str(tmp_path / "x" / late)]
 
 
-def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, monkeypatch):
-    """First what lists the rest; a link and not its target; none while in use."""
-    touch(tmp_path, *MONITOR_FILES[:-1], HIDDEN_FILES[1], *OTHER_FILES)
+def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
+    """Manifest and journal first; links instead of targets; nothing while in use."""
+    touch(tmp_path, *MONITOR_FILES[:-1], *HIDDEN_FILES[1:], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
     folder.mkdir()
@@ -59,8 +86,7 @@ def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, monkeypatch):
     with pytest.raises(DirectoryInUse, match=r"\.openaigym\.0\.1\.lock"):
         mjrec.clear_monitor_files(tmp_path)
     assert set(tmp_path.iterdir()) == before
-    # As a killed process leaves it.
-    lock.let_go()
+    lock.let_go()  # as a killed process does
     removed, real = [], Path.unlink
     monkeypatch.setattr(
         Path, "unlink", lambda p, **rest: (removed.append(p.name), real(p, **rest))
@@ -68,17 +94,16 @@ def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, monkeypatch):
     mjrec.clear_monitor_files(str(tmp_path))
     assert {path.name for path in tmp_path.iterdir()} == {*OTHER_FILES, folder.name}
     assert {name.split(".")[1] for name in removed[:2]} == {"manifest", "episodes"}
-    assert len(removed) == 8
+    assert len(removed) == len(MONITOR_FILES) + len(HIDDEN_FILES)
     mjrec.clear_monitor_files(tmp_path / "missing")
 
 
-def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path):
-    """Lengths, rewards, types and sources follow their timestamps; it is stable."""
+def test_merge_sorts_episodes_by_time(tmp_path):
+    """The sort is stable; each row keeps its length, reward, type and source."""
     write_saved(tmp_path, "0.7", 1, 4, start=0.5, types="te")
-    # Gym noted a type at each reset, so that there are more than episodes.
+    # gym notes a type at each reset, hence more types than episodes.
     write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="ette")
-    # Episodes without a type are training.
-    write_saved(tmp_path, "2.7", 5, types=None)
+    write_saved(tmp_path, "2.7", 5, types=None)  # means training
     paths = sorted(tmp_path.glob("*.stats.json"))
     assert mjrec.merge_stats_files(paths) == (
         [0, 1, 1, 0, 2],
@@ -99,8 +124,8 @@ def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path):
     assert results["episode_types"] is None
 
 
-def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
-    """With or without manifest and episodes; where there is none the result is None."""
+def test_monitors_keep_their_order_in_all_lists(tmp_path, caplog):
+    """A directory without monitors has no results."""
     assert mjrec.load_results(tmp_path / "missing") is None
     assert mjrec.load_results(str(tmp_path)) is None
     assert f"directory {tmp_path / 'missing'} does not exist" in caplog.text
@@ -116,8 +141,7 @@ def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
     assert results["initial_reset_timestamp"] == 0.5
 
 
-def test_unequal_env_infos_are_merged_with_one_warning(tmp_path, caplog):
-    """It shows what differs and where; the newest results' info counts."""
+def test_newest_env_info_wins_with_one_warning(tmp_path, caplog):
     newest = {"gym_version": "mjrec-1", "extra": [1]}
     write_saved(tmp_path, "0.7", 9, start=99.0, env_info=newest)
     assert mjrec.load_results(tmp_path)["env_info"] == newest
@@ -126,13 +150,13 @@ def test_unequal_env_infos_are_merged_with_one_warning(tmp_path, caplog):
     results = mjrec.load_results(tmp_path)
     assert results["env_info"] == newest
     assert results["timestamps"] == [101.0, 109.0]
-    [said] = caplog.messages
-    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in said
-    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in said
+    [warning] = caplog.messages
+    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in warning
+    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in warning
 
 
 def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
-    """Also of a moved directory; one warning for all that are gone."""
+    """One warning names all missing videos."""
     pairs = [(f"v{i}.mp4", f"v{i}.meta.json") for i in range(4)]
     (tmp_path / "old").mkdir()
     write_saved(tmp_path / "old", "1.7", videos=pairs[:1])
@@ -142,27 +166,9 @@ def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
     assert mjrec.load_results(new)["videos"] == [
         tuple(str(new / name) for name in pairs[number]) for number in (2, 0)
     ]
-    [said] = caplog.messages
-    assert "2 of the 4 videos" in said
-    assert "v1.mp4, v3.mp4" in said
-
-
-def test_missing_and_damaged_files_are_named(tmp_path):
-    """First the statistics, then the manifest."""
-    manifest = write_saved(tmp_path, "0.7", 1)
-    path = tmp_path / "openaigym.episode_batch.0.7.stats.json"
-    path.write_text(path.read_text()[:-5])
-    with pytest.raises(UnreadableFile, match=path.name):
-        mjrec.load_results(tmp_path)
-    path.unlink()
-    with pytest.raises(UnreadableFile, match=f"{path.name}: No such file"):
-        mjrec.load_results(tmp_path)
-    manifest.write_text(json.dumps({"stats": "../secret"}))
-    with pytest.raises(UnreadableFile, match=manifest.name):
-        mjrec.load_results(tmp_path)
-
-
-# --- episodes ------------------------------------------------------------------------
+    [warning] = caplog.messages
+    assert "2 of the 4 videos" in warning
+    assert "v1.mp4, v3.mp4" in warning
 
 
 def video(directory, infix, episode_id, suffix):
@@ -171,11 +177,10 @@ def video(directory, infix, episode_id, suffix):
     return path
 
 
-def test_an_episode_of_a_journal_has_its_files(tmp_path):
-    """Numbers, seeds and flags as the monitor knew them; no other monitor's video."""
+def test_journal_episode_has_its_facts_and_files(tmp_path):
+    """The journal says more than statistics; another monitor's video is not taken."""
     facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
     write_journal(tmp_path, "0.7", entry(27, **facts), 28)
-    # The same monitor's statistics hold less of each.
     write_saved(tmp_path, "0.7", 27, 28)
     mp4, meta = (video(tmp_path, "0.7", 27, end) for end in (".mp4", ".meta.json"))
     for infix, end in (("0.7", ".side.mp4"), ("0.7", ".framehash"), ("1.7", ".mp4")):
@@ -188,8 +193,8 @@ def test_an_episode_of_a_journal_has_its_files(tmp_path):
 
 
 @pytest.mark.parametrize("has_journal", [True, False])
-def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
-    """In flight or finished; neither what is there, nor what failed or is live."""
+def test_pending_videos_are_deferred_and_missing(tmp_path, has_journal):
+    """An episode with metadata but no video failed."""
     pending = []
     if has_journal:
         kinds = ["deferred"] * 4 + ["live"]
@@ -209,8 +214,7 @@ def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
     assert [each.trajectory for each in episodes] == trajectories
 
 
-def test_gyms_episodes_have_what_gym_wrote(tmp_path):
-    """Numbered by their index; the rest is None. A gym may die before its manifest."""
+def test_gym_episodes_have_gym_facts_only(tmp_path):
     write_saved(tmp_path, "0.7", 1, 2, types="te").unlink()
     text, meta = (video(tmp_path, "0.7", 1, end) for end in (".json", ".meta.json"))
     _, episode = mjrec.iter_episodes(tmp_path)
@@ -222,8 +226,8 @@ def test_gyms_episodes_have_what_gym_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("types", "linked"), [(None, True), ("ttt", True), ("tttt", False)]
 )
-def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
-    """Gym numbers videos by resets; more of them than ends and a next are in doubt."""
+def test_ambiguous_gym_video_is_left_out(tmp_path, types, linked):
+    """Gym numbers videos by resets, which may be more than its episodes."""
     write_saved(tmp_path, "0.7", 1, 2, types=types)
     video(tmp_path, "0.7", 0, ".mp4")
     first, second = mjrec.iter_episodes(tmp_path)
@@ -231,8 +235,8 @@ def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
     assert (first.type, second.type) == ("t", "t")
 
 
-def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
-    """10 after 9; a missing directory is an error before the first episode."""
+def test_monitors_are_sorted_by_number(tmp_path):
+    """A missing directory is an error before the first episode."""
     infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
     for infix in reversed(infixes):
         write_journal(tmp_path, infix, 0)
@@ -241,12 +245,8 @@ def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
         mjrec.iter_episodes(tmp_path / "missing")
 
 
-# --- memory --------------------------------------------------------------------------
-
-
-def peak_of(read, path):
-    """Return the most bytes that were held while something was read."""
-    # The first time, things are loaded that stay.
+def peak_memory(read, path):
+    """Return the peak of bytes allocated by a second reading."""
     read(path)
     tracemalloc.start()
     try:
@@ -256,29 +256,26 @@ def peak_of(read, path):
         tracemalloc.stop()
 
 
-def list_episodes(directory):
-    """Return how many episodes there are."""
+def count_episodes(directory):
     return sum(1 for _ in mjrec.iter_episodes(directory))
 
 
 def test_memory_does_not_grow_with_the_episodes(tmp_path):
-    """Episodes are read as they are asked for."""
     items = (entry(number, options="x" * 1000) for number in range(5000))
     path = write_journal(tmp_path, "0.7", *items)
-    assert peak_of(list_episodes, tmp_path) < path.stat().st_size / 10
+    assert peak_memory(count_episodes, tmp_path) < path.stat().st_size / 10
 
 
-@parametrize("read", [mjrec.load_results, list_episodes, gather])
-def test_manifests_are_not_kept(tmp_path, read):
-    """What many say of packages takes no more than what a few do."""
+@parametrize("read", [mjrec.load_results, count_episodes, gather])
+def test_manifests_are_not_kept_in_memory(tmp_path, read):
     packages = {
         f"package-{n}": {"version": "1.0", "hash": "0" * 64} for n in range(999)
     }
     large, small = tmp_path / "large", tmp_path / "small"
-    for directory, said in ((large, packages), (small, {})):
+    for directory, listed in ((large, packages), (small, {})):
         directory.mkdir()
         for number in range(40):
-            details = {"provenance": {"packages": said}}
+            details = {"provenance": {"packages": listed}}
             path = write_saved(directory, f"{number}.1", 1, details=details)
-    one = peak_of(read_manifest, large / path.name)
-    assert peak_of(read, large) - peak_of(read, small) < 4 * one
+    one = peak_memory(read_manifest, large / path.name)
+    assert peak_memory(read, large) - peak_memory(read, small) < 4 * one

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Files of evaluation results, and errors of damaged ones."""
+
 import dataclasses
 import json
 import math
@@ -58,7 +60,7 @@ RESULTS = [
 ]
 
 
-def written(directory, **changed):
+def write(directory, **changes):
     facts = {
         "directory": directory,
         "plan": PLAN,
@@ -68,8 +70,8 @@ def written(directory, **changed):
         "selection": {"a,b-v0": [ChosenEpisode(7, 0, "best")]},
         "versions": {"mujoco": "3.4"},
     }
-    results, files = changed.pop("results", RESULTS), changed.pop("files", files_of)
-    write_results(Evaluation(**{**facts, **changed}), results, files)
+    results, files = changes.pop("results", RESULTS), changes.pop("files", files_of)
+    write_results(Evaluation(**{**facts, **changes}), results, files)
     return directory
 
 
@@ -81,9 +83,9 @@ def files_of(result):
     )
 
 
-def test_what_is_written_is_read_back(tmp_path):
-    """Each number bit for bit, and all the rest; results may lack the times."""
-    read = read_results(written(tmp_path))
+def test_results_are_read_back(tmp_path):
+    """Floats stay equal bit for bit; times may be missing."""
+    read = read_results(write(tmp_path))
     assert read.plan == PLAN
     assert (read.summaries, read.across) == ((SUMMARY,), ACROSS)
     assert read.bootstrap == Bootstrap(resamples=10)
@@ -104,9 +106,8 @@ def test_what_is_written_is_read_back(tmp_path):
     assert (first.start_time, first.monitor) == (None, None)
 
 
-def test_the_files_are_what_the_documentation_says(tmp_path):
-    """Header, order, truth, and a line for each episode; JSON for every reader."""
-    written(tmp_path)
+def test_files_match_the_documentation(tmp_path):
+    write(tmp_path)
     assert (tmp_path / "results.csv").read_text().splitlines() == [
         "task,seed,episode,return,length,terminated,truncated,success,failure",
         '"a,b-v0",7,0,0.30000000000000004,5,false,true,true,',
@@ -117,16 +118,16 @@ def test_the_files_are_what_the_documentation_says(tmp_path):
     json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
 
 
-def test_results_are_gone_while_they_are_rewritten(tmp_path):
-    """No tables stand beside another plan's summaries; the way on is to resume."""
+def test_results_are_removed_while_rewritten(tmp_path):
+    """Old tables never stand beside a new plan; the error says how to resume."""
     with pytest.raises(UnreadableFile, match="the directory contains no evaluation"):
         read_results(tmp_path)
     assert not is_evaluation(tmp_path)
     (tmp_path / "evaluation.json").write_text("{}")
     assert is_evaluation(tmp_path)
-    written(tmp_path)
+    write(tmp_path)
     with pytest.raises(ZeroDivisionError):
-        written(tmp_path, files=lambda _: 1 / 0)
+        write(tmp_path, files=lambda _: 1 / 0)
     assert not (tmp_path / "results.json").exists()
     assert not list(tmp_path.glob(".*"))
     with pytest.raises(UnreadableFile, match=f"mjrec evaluate --resume {tmp_path} "):
@@ -134,51 +135,49 @@ def test_results_are_gone_while_they_are_rewritten(tmp_path):
 
 
 DAMAGE = {
-    "another header": ("results.csv", b"task,seed", b"task,sed"),
+    "wrong header": ("results.csv", b"task,seed", b"task,sed"),
     "a missing row": ("results.csv", b'"a,b-v0",3,1,-inf,5,false,true,,\n', b""),
     "half a row": ("results.csv", b",5,false,true,,\n", b""),
-    "one more row": ("results.csv", b"true,true,\n", b"true,true,\n\n"),
-    "a row twice": ("results.csv", b'"a,b-v0",7,1', b'"a,b-v0",7,0'),
+    "empty row": ("results.csv", b"true,true,\n", b"true,true,\n\n"),
+    "duplicate row": ("results.csv", b'"a,b-v0",7,1', b'"a,b-v0",7,0'),
     "a huge number": ("results.csv", b",5,", b"," + b"9" * 5000 + b","),
-    "a number in other words": ("results.csv", b"nan", b"NaN()"),
+    "other notation of NaN": ("results.csv", b"nan", b"NaN()"),
     "a huge line": ("results.csv", b"nan", b"1" * 100_000),
     "an open quote": ("results.csv", b'"it', b'""it'),
     "a row over two lines": ("results.csv", b"said ", b"said\n"),
-    "no UTF-8": ("results.csv", b"said", b"\xff"),
-    "another truth": ("results.csv", b"false", b"0"),
+    "not UTF-8": ("results.csv", b"said", b"\xff"),
+    "other notation of false": ("results.csv", b"false", b"0"),
     "a return and a failure": ("results.csv", b"3,0,,", b"3,0,1.0,"),
     "a NUL": ("results.csv", b"said", b"\0"),
     "a path as a video": ("timing.csv", VIDEO.encode(), b"../../etc/passwd.mp4"),
-    "a video of another": ("timing.csv", b"video000000", b"video000001"),
+    "a video of another episode": ("timing.csv", b"video000000", b"video000001"),
     "a path as a folder": ("timing.csv", b"/seed-007", b"/../seed-007"),
     "a bad infix": ("timing.csv", b",0.w,", b",../0.w,"),
     "another version": ("results.json", b'"format_version": 1', b'"format_version": 2'),
-    "no JSON": ("results.json", b"{", b"["),
+    "not JSON": ("results.json", b"{", b"["),
     "a text for a number": ("results.json", b'"mean": 1.5', b'"mean": "1.5"'),
     "another task": ("results.json", b'"task": "a,b-v0"', b'"task": "c"'),
     "many episodes": ("results.json", b'"episodes": 2', b'"episodes": 999999999'),
-    "a strange choice": ("results.json", b'"best"', b'"best", 2'),
+    "an invalid choice": ("results.json", b'"best"', b'"best", 2'),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_told_and_names_the_file(tmp_path, damage):
-    """Whatever is wrong is one error of ours."""
+def test_damage_is_an_error_that_names_the_file(tmp_path, damage):
     name, good, bad = DAMAGE[damage]
-    path = written(tmp_path) / name
+    path = write(tmp_path) / name
     data = path.read_bytes()
     assert good in data
     path.write_bytes(data.replace(good, bad, 1))
     with pytest.raises(UnreadableFile) as caught:
         read_results(tmp_path)
-    # A plan of other episodes is not that of the table, which may be the wrong one.
+    # A plan that does not fit the table may blame the table.
     assert caught.value.path.name in {name, "results.csv"}
 
 
-def test_a_link_out_of_the_directory_is_not_followed(tmp_path):
-    """Results of strangers do not read the reader's files."""
+def test_link_out_of_the_directory_is_not_followed(tmp_path):
     (tmp_path / "there").mkdir()
-    path = written(tmp_path / "there") / "results.csv"
+    path = write(tmp_path / "there") / "results.csv"
     path.rename(tmp_path / "results.csv")
     path.symlink_to(tmp_path / "results.csv")
     with pytest.raises(UnreadableFile, match="leads out"):
@@ -186,10 +185,9 @@ def test_a_link_out_of_the_directory_is_not_followed(tmp_path):
 
 
 def test_many_episodes_need_little_memory(tmp_path):
-    """A hundred bytes each at most, so that a million fit into 100 MB."""
     count = 20_000
     task = {"tasks": (EvaluatedTask("T-v0", "T"),), "seeds": (0,), "episodes": count}
-    written(
+    write(
         tmp_path,
         plan=dataclasses.replace(PLAN, **task),
         results=[],
@@ -208,5 +206,4 @@ def test_many_episodes_need_little_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert len(read.by_task["T-v0"]) == count
-    # 1 MB for what does not grow.
     assert most < count * 150 + 1_000_000

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories that real gyms wrote are read, and real gym 0.21 agrees with us.
+"""Files of real gym versions are read, and real gym 0.21 reads ours.
 
-`data/gym/<version>/<case>/` was recorded by `legacy/record_gym.py` with that version.
-`data/gym/answers.json` is what gym's own `load_results` made of them, and of what
-`write_ours` writes: `legacy/gym_load_results.py` says how it was made. Gym itself is
-asked under `scripts/test --all`.
+`legacy/record_gym.py` recorded `data/gym/<version>/<case>/` with that version.
+`data/gym/answers.json` has the results of gym's own `load_results` for them and for
+`write_ours`, made by `legacy/gym_load_results.py`. `scripts/test --all` asks gym again.
 """
 
 import json
@@ -24,7 +23,7 @@ DATA = TESTS / "data" / "gym"
 VERSIONS = ["0.7.4", "0.9.6", "0.12.1", "0.17.3", "0.19.0", "0.21.0", "0.22.0"]
 NAN, INF = math.nan, math.inf
 
-# What was played in each case: lengths, rewards, types.
+# Lengths, rewards and types in each case.
 PLAYED = {
     "plain": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
     "text": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
@@ -33,7 +32,7 @@ PLAYED = {
     "unfinished": ([3, 1], [4.5, -2.0], "ee"),
     "empty": ([], [], None),
     "two_monitors": ([3, 3, 1, 1], [4.5, 4.5, -2.0, -2.0], "tete"),
-    # Played as "tee": gym's file has "tteee" and does not say which were surplus.
+    # Played as "tee"; gym wrote "tteee", one for each reset.
     "resets_in_a_row": ([3, 1, 2], [4.5, -2.0, 0.5], "tte"),
 }
 RECORDED = [f"{version}/{case}" for version in sorted(VERSIONS) for case in PLAYED]
@@ -41,7 +40,7 @@ ENV_INFO = {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
 
 
 def write_ours(directory):
-    """Write two monitors with videos, a key of our own, and infinity."""
+    """Write two monitors with videos, our own key, and infinity."""
     directory.mkdir()
     for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
         video = f"openaigym.video.{name}.video000000"
@@ -57,28 +56,27 @@ def write_ours(directory):
 
 
 def recorded_answer(name):
-    """Return what gym made of a directory, by the recorded answers."""
     return as_ours(json.loads((DATA / "answers.json").read_text())[name])
 
 
 def as_ours(answer):
-    """JSON has no tuples."""
+    # JSON has no tuples.
     if answer and answer.get("videos"):
         answer["videos"] = [tuple(pair) for pair in answer["videos"]]
     return answer
 
 
 def assert_same(ours, gyms, *, but=()):
-    """Compare key by key; keys of `but` are compared elsewhere."""
+    """Compare all keys except those in `but`."""
     assert list(ours) == list(gyms)
     for key in [key for key in ours if key not in but]:
-        # NaN is equal to nothing; its text is.
+        # The text of NaN equals itself.
         assert repr(ours[key]) == repr(gyms[key]), key
 
 
 @pytest.mark.parametrize("name", RECORDED)
-def test_what_a_gym_wrote_is_read(name, monkeypatch):
-    """What was played, and as gym read it, except where gym is known to be wrong."""
+def test_directories_of_gym_are_read(name, monkeypatch):
+    """Results equal gym's, except for known errors of gym."""
     monkeypatch.chdir(DATA)
     version, _, case = name.partition("/")
     ours, gyms = mjrec.load_results(Path(name)), recorded_answer(name)
@@ -94,7 +92,7 @@ def test_what_a_gym_wrote_is_read(name, monkeypatch):
             assert "missing expected key env_id" in gyms["error"]
             assert ours["env_info"] == {"gym_version": version}
         case "two_monitors":
-            # It lists no start for the idle monitor and shifts the types.
+            # gym lists no start for the idle monitor and shifts the types.
             but = ("initial_reset_timestamps", "episode_types")
             assert_same(ours, gyms, but=but)
             starts = ours["initial_reset_timestamps"]
@@ -112,8 +110,7 @@ def test_what_a_gym_wrote_is_read(name, monkeypatch):
         assert videos == ours["videos"]
 
 
-def test_gym_agreed_on_what_we_write(tmp_path, monkeypatch):
-    """Both our files and what we read in them are those that gym was asked about."""
+def test_recorded_gym_reads_our_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_ours(Path("ours"))
     gyms = recorded_answer("ours")
@@ -121,8 +118,7 @@ def test_gym_agreed_on_what_we_write(tmp_path, monkeypatch):
     assert_same(mjrec.load_results(Path("ours")), gyms)
 
 
-def test_a_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
-    """All of gym 0.21's files, and `mjrec` beside them."""
+def test_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 1)
     for kind, added in (("manifest", {"mjrec"}), ("stats", set())):
@@ -135,10 +131,10 @@ def test_a_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
 
 @pytest.fixture
 def ask_gym():
-    """Return what asks gym 0.21.0 in its own environment for its `load_results`."""
+    """Return a function that asks the `load_results` of gym 0.21.0."""
     if "MJREC_TEST_GYM" not in os.environ:
         pytest.skip("no environment with gym 0.21.0: scripts/test --all makes one")
-    # Warnings are errors in these tests, not in gym.
+    # gym may warn.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
 
     def ask(*directories):
@@ -155,7 +151,6 @@ def ask_gym():
 
 @pytest.mark.old_gym
 def test_gym_answers_as_recorded(ask_gym, tmp_path, monkeypatch):
-    """About all the directories that the tests above compare."""
     monkeypatch.chdir(tmp_path)
     for version in VERSIONS:
         Path(version).symlink_to(DATA / version)
@@ -165,10 +160,7 @@ def test_gym_answers_as_recorded(ask_gym, tmp_path, monkeypatch):
 
 
 @pytest.mark.old_gym
-def test_gym_agrees_on_what_a_monitor_writes(
-    ask_gym, tmp_path, corridor, make_corridor, play
-):
-    """Two runs with all that a monitor writes; a NaN is null, and harms no other."""
+def test_gym_reads_files_of_monitors(ask_gym, tmp_path, corridor, make_corridor, play):
     stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
     write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
     [gyms] = ask_gym(tmp_path).values()
@@ -179,9 +171,8 @@ def test_gym_agrees_on_what_a_monitor_writes(
         play(env, 2)
         env.reset()
         env.step(0)
-    with mjrec.Monitor(
-        make_corridor(length=2), tmp_path, resume=True, mode="evaluation"
-    ) as env:
+    again = {"resume": True, "mode": "evaluation"}
+    with mjrec.Monitor(make_corridor(length=2), tmp_path, **again) as env:
         play(env, 2)
     [gyms] = ask_gym(tmp_path).values()
     assert gyms["episode_lengths"] == [3, 3, 2, 2]

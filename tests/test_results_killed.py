@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nothing that was completed is lost with a monitor that never closed."""
+"""Results of monitors that never closed."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ READERS = (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path)))
 
 @pytest.fixture
 def late(tmp_path):
-    """A monitor died after its fifth episode; its manifest has four, and one video."""
+    """Files of a monitor killed after episode 5; its manifest has 4, and one video."""
     names = map(VIDEO.format, (0, 4))
     videos = [(name, name.replace("mp4", "meta.json")) for name in names]
     for mp4, metadata in videos:
@@ -31,7 +31,7 @@ def late(tmp_path):
 
 
 def load(directory):
-    """Return its results, which tell of as many episodes as there are."""
+    """Load results, and compare them with the episodes."""
     results = mjrec.load_results(directory)
     episodes = list(mjrec.iter_episodes(directory))
     assert [each.length for each in episodes] == results["episode_lengths"]
@@ -43,8 +43,8 @@ def only(directory, pattern):
     return path
 
 
-def test_a_journal_is_enough(tmp_path, caplog):
-    """The episode in flight does not count."""
+def test_journal_alone_gives_results(tmp_path, caplog):
+    """The running episode does not count."""
     journal = write_journal(
         *(tmp_path, "0.7", entry(0), entry(1), entry(2, type="e", seed=None)),
         run={"env_info": ENV_INFO},
@@ -69,8 +69,8 @@ def test_a_journal_is_enough(tmp_path, caplog):
     assert {record.levelname for record in caplog.records} == {"WARNING"}
 
 
-def test_an_older_manifest_does_not_hide_the_last_episodes(late):
-    """The journal has one more; finished videos are found, broken ones are not."""
+def test_journal_completes_an_older_manifest(late):
+    """Finished videos are found, broken ones are not."""
     manifest = only(late, "*.manifest.json")
     results = load(late)
     assert results["timestamps"] == [100, 101, 102, 103, 104]
@@ -85,11 +85,12 @@ def test_an_older_manifest_does_not_hide_the_last_episodes(late):
     assert load(late)["videos"] == videos[1:]
 
 
-def test_open_and_resumed_monitors_are_merged_with_the_dead(late, make_corridor, play):
-    """Each once, and numbered on; an open one as if it had died now."""
-    with mjrec.Monitor(
-        make_corridor(2), late, resume=True, video_callable=False
-    ) as env:
+def test_open_and_resumed_monitors_are_merged_with_killed_ones(
+    late, make_corridor, play
+):
+    """Each counts once, in one numbering."""
+    options = {"resume": True, "video_callable": False}
+    with mjrec.Monitor(make_corridor(2), late, **options) as env:
         play(env, 2)
         opened = load(late)
     closed = load(late)
@@ -106,7 +107,7 @@ def test_open_and_resumed_monitors_are_merged_with_the_dead(late, make_corridor,
     ("journal", "count"), [((3, 4), 3), ((4, 5, 6), 3), ((1, 2, 3, 4), 4)]
 )
 def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
-    """Never both; the statistics file where they are equal. Lines do not count."""
+    """The statistics file wins a tie; duplicate lines do not count."""
     write_saved(tmp_path, "0.7", 1, 2, 3)
     write_journal(tmp_path, "0.7", *journal, *journal[-1:] * 4)
     results = mjrec.load_results(tmp_path)
@@ -115,17 +116,16 @@ def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
 
 
 @pytest.mark.parametrize("lock", ["dead", "link", "", "[1]"])
-def test_without_a_manifest_journal_and_lock_say_what_was_recorded(
-    tmp_path, lock, caplog
-):
-    """What no file says is no difference; no link in place of a lock is read."""
+def test_journal_or_lock_names_the_environment(tmp_path, lock, caplog):
+    """Unknown facts give no warning; a link in place of a lock is not read."""
     write_journal(tmp_path, "0.7", 1)
-    path, said = tmp_path / ".openaigym.0.7.lock", {"run": {"env_info": ENV_INFO}}
+    path = tmp_path / ".openaigym.0.7.lock"
+    content = json.dumps({"run": {"env_info": ENV_INFO}})
     if lock == "link":
-        (tmp_path / "secret").write_text(json.dumps(said))
+        (tmp_path / "secret").write_text(content)
         path.symlink_to("secret")
     else:
-        path.write_text(json.dumps(said) if lock == "dead" else lock)
+        path.write_text(content if lock == "dead" else lock)
     known = ENV_INFO if lock == "dead" else {"gym_version": "mjrec-1"}
     assert load(tmp_path)["env_info"] == known
     write_journal(tmp_path, "1.7", 2, run={"env_info": ENV_INFO})
@@ -135,8 +135,8 @@ def test_without_a_manifest_journal_and_lock_say_what_was_recorded(
 
 @pytest.mark.parametrize("pattern", ["*.manifest.json", "*.stats.json"])
 @pytest.mark.parametrize("content", [None, b"{", b'{"stats": "../x"}'])
-def test_a_journal_stands_in_for_damaged_files(tmp_path, pattern, content, caplog):
-    """With a warning that names the file; without a journal it is an error."""
+def test_journal_replaces_damaged_files(tmp_path, pattern, content, caplog):
+    """A warning names the file; without a journal it is an error."""
     write_saved(tmp_path, "0.7", 1, 2)
     journal = write_journal(tmp_path, "0.7", 1, 2, run={"env_info": ENV_INFO})
     damaged = only(tmp_path, pattern)
@@ -145,7 +145,7 @@ def test_a_journal_stands_in_for_damaged_files(tmp_path, pattern, content, caplo
     else:
         damaged.write_bytes(content)
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    # A manifest that is not there is what a killed monitor leaves.
+    # A killed monitor has no manifest.
     if content is not None or "stats" in pattern:
         assert [damaged.name in r.getMessage() for r in caplog.records] == [True] * 2
         journal.unlink()
@@ -154,8 +154,7 @@ def test_a_journal_stands_in_for_damaged_files(tmp_path, pattern, content, caplo
                 read(tmp_path)
 
 
-def test_statistics_stand_in_for_a_damaged_journal(tmp_path, caplog):
-    """With every line damaged; then a link, which is named and never followed."""
+def test_statistics_replace_a_damaged_journal(tmp_path, caplog):
     details = {"first_episode_id": 1, "next_episode_id": 3}
     manifest = write_saved(tmp_path, "0.7", 1, 2, details=details)
     journal = write_journal(tmp_path, "0.7")
@@ -165,8 +164,8 @@ def test_statistics_stand_in_for_a_damaged_journal(tmp_path, caplog):
     journal.unlink()
     journal.symlink_to("/proc/self/status")
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    said = [f"{journal}: it is a link" in each.getMessage() for each in caplog.records]
-    assert said == [True, True]
+    named = [f"{journal}: it is a link" in each for each in caplog.messages]
+    assert named == [True, True]
     manifest.unlink()
     only(tmp_path, "*.stats.json").unlink()
     for read in READERS:
@@ -175,8 +174,8 @@ def test_statistics_stand_in_for_a_damaged_journal(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("lost", [0, 3])
-def test_a_lost_line_of_a_journal_costs_its_details_only(tmp_path, lost):
-    """The statistics have the episode, and its neighbours a number for it."""
+def test_lost_journal_line_costs_only_its_details(tmp_path, lost):
+    """Statistics have the episode; its neighbors give its number."""
     details = {"first_episode_id": 5, "next_episode_id": 9}
     write_saved(tmp_path, "0.7", 5, 6, 7, 8, details=details)
     journal = write_journal(tmp_path, "0.7", 5, 6, 7, 8)
@@ -194,17 +193,16 @@ def test_a_lost_line_of_a_journal_costs_its_details_only(tmp_path, lost):
 @pytest.mark.parametrize(
     ("saved", "journal", "following", "numbers", "shown"),
     [
-        # Episode 6 or 7 was reset in mid-episode; nothing says which.
+        # Episode 6 or 7 was reset early; no file says which.
         ((5, 7, 8), (5, 8), 9, [5, 6, 8], [True, False, True]),
-        # The journal is lost, and every number was completed; then not every one.
+        # The journal is lost; all numbers were completed, or not all.
         ((5, 6), (), 7, [5, 6], [True, True]),
         ((5, 6), (), 8, [5, 6], [False, False]),
     ],
 )
-def test_an_episode_in_doubt_shows_no_video(
+def test_episode_with_an_uncertain_number_shows_no_video(
     tmp_path, saved, journal, following, numbers, shown
 ):
-    """Where its number is lost, and it may be that of another."""
     details = {"first_episode_id": 5, "next_episode_id": following}
     write_saved(tmp_path, "0.7", *saved, details=details)
     if journal:

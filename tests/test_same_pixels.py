@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is drawn from recorded states is what `render()` shows, byte for byte."""
+"""Frames drawn from recorded states equal those of `render()`, byte for byte."""
 
 import contextlib
 import copy
 import gc
 import importlib.util
 import json
+from pathlib import Path
 
 import gymnasium
 import mujoco
@@ -44,28 +45,25 @@ def suite_tasks():
     return list(suite.ALL_TASKS)
 
 
-def every(names, cases, *default):
-    """Try all environments under `scripts/test --all`, and these by default."""
+def parametrize_environments(names, cases, *default):
     return parametrize(names, cases, default=default, part=pytest.mark.environments)
 
 
 @pytest.fixture(scope="module")
 def workers():
-    """A process that draws, and three that share a video."""
     with WorkerPool(1) as one, WorkerPool(3) as three:
         yield [one, three]
 
 
 def check_frames(directory, live, workers, *, is_seen_to_move=True):
-    """Check that the frames of a recording are the frames of their moments."""
+    """Check that drawn frames equal live frames."""
     paths = {*directory.glob("*.h5"), *in_flight(directory)}
     for episode, frames in enumerate(live):
         [path] = [p for p in paths if p.name.endswith(f".episode{episode:06d}.h5")]
         for pool in workers[: 1 if episode else None]:
             drawn = list(pool.frames(path, range(len(frames))))
             np.testing.assert_array_equal(drawn, frames)
-    # There was something to compare.
-    assert live[0][0].std() > 3
+    assert live[0][0].std() > 3  # not blank
     if is_seen_to_move:
         assert len({frame.tobytes() for frames in live for frame in frames}) > len(live)
 
@@ -76,9 +74,8 @@ def monitored(env, directory, **options):
 
 
 def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
-    """Record two episodes, and return the frames of every moment."""
-    # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
-    # current: one that an earlier test has left is not to go between two frames.
+    """Record two episodes, and return all frames."""
+    # MuJoCo frees a viewer in the current context: collect those of earlier tests now.
     gc.collect()
     with monitored(env, directory, **options) as monitor:
         frame = frame or monitor.render
@@ -88,7 +85,7 @@ def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
 
 
 def episodes(env, wrapped, look, each_step=lambda _: None):
-    """Play two episodes, and yield what is seen at the moments of each."""
+    """Play two episodes; yield each one's results of `look`."""
     random = np.random.RandomState(1)
     is_gymnasium = hasattr(env, "unwrapped")
     space = env.action_space if is_gymnasium else env.action_spec()
@@ -108,7 +105,6 @@ def episodes(env, wrapped, look, each_step=lambda _: None):
 
 
 def draw_quickly(model):
-    """Make a model whose frames cost a software renderer little."""
     model.vis.quality.shadowsize = 256
     model.vis.quality.offsamples = 0
 
@@ -119,41 +115,36 @@ def make(env_id, **kwargs):
     return env
 
 
-# --- Gymnasium -----------------------------------------------------------------------
-
-
-def test_quality_that_the_model_asks_for(workers, tmp_path):
-    """Gymnasium's own, with shadows and smooth edges; all others are simpler."""
+def test_full_quality(workers, tmp_path):
+    """With Gymnasium's shadows and antialiasing, which the other tests reduce."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array")
     live = record(gymnasium.wrappers.TimeLimit(env, 2), tmp_path)
     check_frames(tmp_path, live, workers[:1])
 
 
-@every("env_id", GYMNASIUM, "HalfCheetah-v5")
+@parametrize_environments("env_id", GYMNASIUM, "HalfCheetah-v5")
 def test_gymnasium(env_id, workers, tmp_path):
-    """The default camera, which the first frame settles."""
     check_frames(tmp_path, record(make(env_id), tmp_path), workers)
 
 
-@every("env_id", GYMNASIUM, "Hopper-v5")
+@parametrize_environments("env_id", GYMNASIUM, "Hopper-v5")
 def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
-    """Made with the environment, by name or number; or asked of the monitor."""
+    """The environment or the monitor names the camera."""
     model = gymnasium.make(env_id).unwrapped
     for number in range(model.model.ncam):
         name = model.model.camera(number).name
         camera = {"camera_name": name} if name else {"camera_id": number}
         live = record(make(env_id, **camera), tmp_path / str(number))
         check_frames(tmp_path / str(number), live, workers[:1])
-        asked = make(env_id, render_mode=None, height=9, width=9)
+        bare = make(env_id, render_mode=None, height=9, width=9)
         view = {"camera": name or number, **SIZE}
-        record(asked, tmp_path / f"{number} asked", list, **view)
-        check_frames(tmp_path / f"{number} asked", live, workers[:1])
+        record(bare, tmp_path / f"{number} bare", list, **view)
+        check_frames(tmp_path / f"{number} bare", live, workers[:1])
 
 
-def test_camera_and_options_that_the_user_gave(workers, tmp_path, monkeypatch):
-    """Those of the environment's arguments, and of its viewer in mid-episode."""
-    # MuJoCo writes a log file when the scene is full.
-    monkeypatch.chdir(tmp_path)
+def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
+    """The viewer changes within an episode."""
+    monkeypatch.chdir(tmp_path)  # for MuJoCo's log of full scenes
     env = make(
         "Ant-v5",
         max_geom=12,
@@ -169,16 +160,15 @@ def test_camera_and_options_that_the_user_gave(workers, tmp_path, monkeypatch):
     check_frames(tmp_path, record(env, tmp_path, each_step=change), workers[:1])
 
 
-@every("env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5")
+@parametrize_environments(
+    "env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5"
+)
 def test_robotics(env_id, workers, tmp_path):
     """Also where each `render` moves goals."""
     with robots_that_reset():
         live = record(make(env_id), tmp_path)
-    # In large mazes the ant is too small to be seen.
+    # The ant is too small to see in large mazes.
     check_frames(tmp_path, live, workers[:1], is_seen_to_move=False)
-
-
-# --- dm_control ----------------------------------------------------------------------
 
 
 def record_dm(env, directory, camera):
@@ -190,14 +180,14 @@ def record_dm(env, directory, camera):
 
 
 @pytest.mark.dm_control
-@every(
+@parametrize_environments(
     "domain, task, visualize_reward",
     [(*task, reward) for task in suite_tasks() for reward in (False, True)],
     ("finger", "turn_easy", True),
     ("quadruped", "escape", False),
 )
 def test_suite(domain, task, visualize_reward, workers, tmp_path):
-    """Every task, from every camera, and with colours that show the reward."""
+    """Each task from each camera; `visualize_reward` changes colors."""
     from dm_control import suite
 
     options = {"task_kwargs": {"random": 5}, "visualize_reward": visualize_reward}
@@ -211,7 +201,7 @@ def test_suite(domain, task, visualize_reward, workers, tmp_path):
 
 
 def composer_environments():
-    """Return what makes each; no soccer, whose rewards are one for each player."""
+    """Return constructors by name, without soccer, which has a reward per player."""
     if not has_dm_control:
         return {}
     from dm_control import manipulation
@@ -231,105 +221,61 @@ def composer_environments():
 
 
 @pytest.mark.dm_control
-@every(
+@parametrize_environments(
     "name, camera",
     [(name, camera) for name in composer_environments() for camera in (None, 0)],
     ("reach_site_features", None),
 )
 def test_composer(name, camera, workers, tmp_path):
-    """Tasks that compile another model for every episode."""
+    """Such tasks compile a new model for each episode."""
     live = record_dm(composer_environments()[name](), tmp_path, camera)
     check_frames(tmp_path, live, workers[:1])
 
 
-# --- one's own -----------------------------------------------------------------------
-
-ENDLESS = """
-<mujoco>
-  <visual><quality shadowsize="256" offsamples="0"/><map zfar="50"/></visual>
-  <asset>
-    <texture name="checks" type="2d" builtin="checker" rgb1=".2 .6 .3" rgb2=".8 .8 .7"
-      width="32" height="32"/>
-    <material name="checks" texture="checks" texrepeat="1.7 1.7" reflectance=".2"/>
-  </asset>
-  <worldbody>
-    <light directional="true" dir="0 .3 -1"/>
-    <geom type="plane" size="0 0 1" material="checks"/>
-    <body pos="0 0 .5">
-      <joint name="rail" type="slide" axis="1 .3 0"/>
-      <geom size=".3" rgba="1 .2 .1 1" mass="1"/>
-      <camera name="ride" mode="trackcom" pos="0 -3 1.5" xyaxes="1 0 0 0 .4 .9"/>
-      <site name="hook" pos="0 0 1"/>
-      <body pos="0 0 .4">
-        <joint axis="0 1 0"/>
-        <geom type="capsule" size=".05" fromto="0 0 0 .6 0 0"/>
-        <site name="end" pos=".6 0 0"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <spatial limited="true" range="0 .9" width=".03">
-      <site site="hook"/><site site="end"/>
-    </spatial>
-  </tendon>
-  <actuator>
-    <motor joint="rail" gear="400000" ctrllimited="true" ctrlrange="-1 1"/>
-  </actuator>
-</mujoco>
-"""
-
-
-@pytest.fixture
-def endless(tmp_path):
-    path = tmp_path / "endless.xml"
-    path.write_text(ENDLESS)
+def own_environment(name):
     options = EnvironmentOptions(**SIZE, max_steps=STEPS)
-    return environment_from_name(str(path), options).environment
+    path = Path(__file__).parents[1] / "assets" / f"{name}.xml"
+    env = environment_from_name(str(path), options).environment
+    draw_quickly(env.unwrapped.simulation.model)
+    return env
 
 
-def test_own_model_over_an_infinite_plane(endless, workers, tmp_path):
-    """It is drawn around the camera of the frame before; and a tendon is taut."""
-    check_frames(tmp_path / "out", record(endless, tmp_path / "out"), workers)
+@pytest.mark.parametrize("name", ["walker_on_plane", "showcase"])
+def test_own_model(name, workers, tmp_path):
+    """An infinite plane is drawn around the previous frame's camera."""
+    check_frames(tmp_path, record(own_environment(name), tmp_path), workers)
 
 
-def test_an_episode_may_forget_the_frames_before(endless, tmp_path):
-    """Cameras are where they are in a new simulation then."""
-    directory, previous = tmp_path / "out", []
-    with monitored(endless, directory) as monitor:
+def test_forget_frames_resets_cameras(tmp_path):
+    previous = []
+    with monitored(own_environment("walker_on_plane"), tmp_path) as monitor:
         for number in range(3):
             if number == 2:
                 monitor.forget_frames()
             monitor.reset(seed=0)
             monitor.step(np.zeros(1))
         monitor.close(wait=False)
-    for path in in_flight(directory):
+    for path in in_flight(tmp_path):
         with open_trajectory(path) as reader:
             previous.append(reader.facts["scene"]["previous_cameras"])
     assert [each is None for each in previous] == [True, False, True]
 
 
 class Negative(InvertedPendulumEnv):
-    """Shows itself in other colours."""
-
     def render(self):
         return 255 - super().render()
 
 
 @pytest.mark.parametrize(
-    ("make_env", "named"),
+    ("kind", "mode", "named"),
     [
-        (
-            lambda: Negative(render_mode="rgb_array", **SIZE),
-            "Negative overrides render()",
-        ),
-        (lambda: InvertedPendulumEnv(render_mode="depth_array", **SIZE), "depth_array"),
+        (Negative, "rgb_array", "Negative overrides render()"),
+        (InvertedPendulumEnv, "depth_array", "depth_array"),
     ],
 )
-def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
-    make_env, named, tmp_path
-):
-    """Said in the error, or in the metadata of the video of what render() shows."""
-    env = make_env()
+def test_overridden_render_is_recorded_live(kind, mode, named, tmp_path):
+    """`render="deferred"` is an error; metadata names the reason."""
+    env = kind(render_mode=mode, **SIZE)
     with pytest.raises(mjrec.PicturesDiffer) as error:
         mjrec.Monitor(env, tmp_path / "out", render="deferred")
     assert named.partition(" ")[0] in str(error.value)
@@ -348,25 +294,25 @@ POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
 
 
 @pytest.mark.parametrize(
-    ("options", "arrays", "said"),
+    ("options", "arrays", "reason"),
     [
         ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT in the visual options"),
-        # The first frame is compared, whatever the reason for a difference is.
+        # The self-check compares the first frame.
         ({}, ("geom_xmat",), "drawn from its snapshot differs"),
     ],
 )
-def test_what_states_do_not_tell_is_drawn_live(
-    options, arrays, said, tmp_path, monkeypatch, caplog
+def test_frames_that_states_cannot_give_are_drawn_live(
+    options, arrays, reason, tmp_path, monkeypatch, caplog
 ):
-    """Why is in the log; it is an error where another way was asked for."""
+    """The log names the reason; `render="deferred"` is an error."""
     if arrays:
         monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", arrays)
     env = make("InvertedPendulum-v5", **options)
-    with pytest.raises(mjrec.PicturesDiffer, match=said):
+    with pytest.raises(mjrec.PicturesDiffer, match=reason):
         monitored(env, tmp_path / "deferred").reset(seed=0)
     with mjrec.Monitor(env, tmp_path / "live", allow_early_reset=True) as monitor:
         monitor.reset(seed=0)
-    assert said in caplog.text
+    assert reason in caplog.text
     assert len(frames_in(tmp_path / "live", 0)) == 1
 
 
@@ -375,7 +321,7 @@ def show(viewer, what):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         (lambda env, viewer: viewer.add_marker(pos=np.zeros(3)), "markers were added"),
         (
@@ -387,8 +333,7 @@ def show(viewer, what):
         (lambda env, viewer: show(viewer, "INERTIA"), "xipos"),
     ],
 )
-def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
-    """In the middle of an episode; nothing is shown that `render()` does not."""
+def test_frames_end_where_states_no_longer_suffice(change, reason, tmp_path, caplog):
     env = make("InvertedPendulum-v5")
     monitor = monitored(env, tmp_path)
     monitor.reset(seed=0)
@@ -396,29 +341,22 @@ def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
     change(env.unwrapped, env.unwrapped.mujoco_renderer.viewer)
     monitor.step(np.zeros(1))
     monitor.close()
-    assert said in caplog.text
+    assert reason in caplog.text
     [path] = tmp_path.glob("*.trajectory.*")
     with open_trajectory(path) as trajectory:
         assert trajectory.frame_count == 1
 
 
-# --- recording disturbs nothing ------------------------------------------------------
-
-
-# dm_control's, without which there is no such task.
 QUADRUPED = pytest.param("quadruped-escape", marks=pytest.mark.dm_control)
 
 
-@every(
+@parametrize_environments(
     "name",
     ["HalfCheetah-v5", *robotics_ids(), QUADRUPED],
     *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1", QUADRUPED),
 )
 def test_recording_disturbs_nothing(name, tmp_path):
-    """Bit for bit all is as without, random numbers too, also where render() disturbs.
-
-    And no viewer or context is made.
-    """
+    """States and random numbers stay equal bit for bit; no viewer is made."""
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def run(wrap):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said by a process with limits, and how it ends."""
+"""How a sandboxed process reports its end."""
 
 import contextlib
 import os
@@ -16,14 +16,14 @@ from waiting import wait_until
 from mjrec.sandbox import Sandbox
 
 _COMPILER = "mjrec.simulation.foreign_files"
-_FOR_EVER = (
+_ENDLESS = (
     '<mujoco><worldbody><replicate count="100000000"><geom size="1"/></replicate>'
     "</worldbody></mujoco>"
 )
 
 
 def compiling(parent):
-    """Return the process that compiles; importing mujoco starts others."""
+    """Return the compiler's process; importing mujoco starts others."""
     return [pid for pid in children(parent) if f"-m\0{_COMPILER}" in command_of(pid)]
 
 
@@ -33,21 +33,20 @@ def command_of(pid):
     return ""
 
 
-def test_a_death_is_told_with_its_last_words(tmp_path):
-    """Of a request that it does not understand, it dies."""
+def test_death_is_reported_with_status_and_traceback(tmp_path):
+    """An invalid request kills the process."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
         assert list(sandbox.answers(60)) == []
-        said = sandbox.last_words()
-    assert said.startswith("ended with status 1")
-    assert "KeyError: 'task'" in said
+        report = sandbox.last_words()
+    assert report.startswith("ended with status 1")
+    assert "KeyError: 'task'" in report
 
 
-def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path):
-    """Nobody would wait for it, or stop it, for days."""
+def test_busy_process_ends_with_its_parent(tmp_path):
     path = tmp_path / "openaigym.model.0123456789abcdef.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
-        archive.writestr("source/main.xml", _FOR_EVER)
+        archive.writestr("source/main.xml", _ENDLESS)
     program = (
         "from pathlib import Path\n"
         "from mjrec.simulation.foreign_files import compile_sources\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`save_video` against Gymnasium's contract."""
+"""`save_video` keeps the contract of Gymnasium's `save_video`."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from mjrec.errors import InvalidArgument, UnknownName
 
 
 def shades(count, made=None):
-    """Yield one buffer again and again, and note the frames that are made."""
+    """Yield one buffer with growing brightness; list the frames in `made`."""
     buffer = np.empty((16, 16, 3), np.uint8)
     for number in range(count):
         if made is not None:
@@ -20,12 +20,11 @@ def shades(count, made=None):
 
 
 def shown(path):
-    """Return the numbers of the shades that a video shows."""
+    """Return the numbers of a video's shades."""
     return [round((frame.mean() - 20) / 6) for frame in frames_of(path)]
 
 
-def test_the_default_is_the_capped_cubic_schedule(tmp_path, names):
-    """Without triggers: cubes and thousands, under Gymnasium's name, every frame."""
+def test_default_is_the_capped_cubic_schedule(tmp_path, names):
     for episode in (2, 8, 999, 1000):
         mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
     assert names(tmp_path) == ["rl-video-episode-1000.mp4", "rl-video-episode-8.mp4"]
@@ -35,7 +34,7 @@ def test_the_default_is_the_capped_cubic_schedule(tmp_path, names):
 
 @pytest.mark.parametrize("kind", ["array", "generator"])
 def test_both_triggers_may_be_used(tmp_path, kind):
-    """Videos end after `video_length` frames, or with the last one."""
+    """Videos end after `video_length` frames, or with the last frame."""
     frames = shades(8)
     if kind == "array":
         frames = np.array([frame.copy() for frame in frames])
@@ -47,19 +46,14 @@ def test_both_triggers_may_be_used(tmp_path, kind):
 
 
 @pytest.mark.parametrize(("length", "count"), [(3, 3), (None, 9), (50, 9)])
-def test_a_generator_is_streamed_and_read_no_further_than_needed(
-    tmp_path, length, count
-):
-    """Only the asked-for frames are made."""
+def test_generator_makes_only_the_frames_needed(tmp_path, length, count):
     made = []
     options = {"video_length": length, "fps": 30}
     mjrec.save_video(shades(9, made), tmp_path, lambda _: True, **options)
     assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
-def test_the_frames_before_an_error_are_kept(tmp_path):
-    """What the generator raises goes through, and the video holds what came before."""
-
+def test_frames_before_an_error_are_kept(tmp_path):
     def frames():
         yield from shades(4)
         raise ZeroDivisionError
@@ -77,8 +71,9 @@ def test_the_frames_before_an_error_are_kept(tmp_path):
         ({"fps": 30, "video_length": 0}, InvalidArgument, "video_length"),
     ],
 )
-def test_options_are_checked_first(tmp_path, options, error, message):
-    """Before the folder is made."""
+def test_options_are_checked_before_the_folder_is_made(
+    tmp_path, options, error, message
+):
     with pytest.raises(error, match=message):
         mjrec.save_video([*shades(2)], tmp_path / "videos", **options)
     assert not list(tmp_path.iterdir())

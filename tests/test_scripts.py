@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that a new user runs first, as far as no download is needed."""
+"""The scripts of a checkout, as far as they need no download."""
 
 import os
 import shutil
@@ -14,13 +14,11 @@ ROOT = Path(__file__).parents[1]
 COMMANDS = [f"scripts/{name}" for name in ("setup", "demo", "test", "docs", "build")]
 COMMANDS += [".ci/run"]
 
-# Stands before a function call: the real file, sourced as demo and test do.
 SOURCE = "set -euo pipefail; source scripts/setup; libraries=; "
 
 
 @pytest.fixture
 def checkout(tmp_path):
-    """What the commands read of the repository, at a place of its own."""
     for name in ("scripts", ".ci"):
         shutil.copytree(ROOT / name, tmp_path / "checkout" / name)
     shutil.copy(ROOT / "pyproject.toml", tmp_path / "checkout")
@@ -29,18 +27,13 @@ def checkout(tmp_path):
 
 def bash(checkout, command, **environment):
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MJREC_")}
-    return subprocess.run(
-        ["bash", "-c", command],
-        cwd=checkout,
-        env={**kept, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    options = {"cwd": checkout, "env": {**kept, **environment}, "timeout": 60}
+    command = ["bash", "-c", command]
+    return subprocess.run(command, capture_output=True, text=True, **options)
 
 
-def holds(checkout, condition):
-    """Return whether a function of the scripts says yes."""
+def succeeds(checkout, condition):
+    """Return whether a shell function's exit status is 0."""
     answer = bash(checkout, SOURCE + condition)
     assert answer.returncode in (0, 1), answer.stderr
     return answer.returncode == 0
@@ -52,37 +45,36 @@ MUST_BE_MADE_ANEW = 'must_be_made_anew "$venv"'
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_installs_nothing(checkout, command):
-    """A clone can run the commands; asking what one does changes nothing."""
     answer = bash(checkout, f"{command} --help")
     assert answer.returncode == 0
     assert answer.stdout.startswith("usage: scripts/")
     assert not (checkout / ".venv").exists()
 
 
-def test_an_installation_is_repeated_only_where_it_must_be(checkout, tmp_path):
-    """When pyproject.toml has changed, it was interrupted, or the checkout moved."""
+def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
+    """After a change to pyproject.toml, an interruption, or a move of the checkout."""
     venv = checkout / ".venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
-    assert not holds(checkout, IS_INSTALLED)
-    # What a finished installation leaves.
+    assert not succeeds(checkout, IS_INSTALLED)
+    # The stamp of a finished installation.
     stamp = '"$(stamp_of "$venv" demo)"'
-    assert holds(checkout, f'describe_installation "$venv" -e . >{stamp}')
-    assert holds(checkout, IS_INSTALLED)
-    assert not holds(checkout, MUST_BE_MADE_ANEW)
+    assert succeeds(checkout, f'describe_installation "$venv" -e . >{stamp}')
+    assert succeeds(checkout, IS_INSTALLED)
+    assert not succeeds(checkout, MUST_BE_MADE_ANEW)
     (venv / "mjrec-unfinished").touch()
-    assert not holds(checkout, IS_INSTALLED)
-    assert holds(checkout, MUST_BE_MADE_ANEW)
+    assert not succeeds(checkout, IS_INSTALLED)
+    assert succeeds(checkout, MUST_BE_MADE_ANEW)
     (venv / "mjrec-unfinished").unlink()
     with (checkout / "pyproject.toml").open("a") as project:
         project.write("\n# another\n")
-    assert not holds(checkout, IS_INSTALLED)
-    # An environment's scripts name the place where it was made.
-    assert not holds(checkout, MUST_BE_MADE_ANEW)
-    assert holds(checkout.rename(tmp_path / "moved"), MUST_BE_MADE_ANEW)
+    assert not succeeds(checkout, IS_INSTALLED)
+    # Scripts of a virtual environment contain its path.
+    assert not succeeds(checkout, MUST_BE_MADE_ANEW)
+    assert succeeds(checkout.rename(tmp_path / "moved"), MUST_BE_MADE_ANEW)
 
 
 @pytest.mark.parametrize(
-    ("command", "environment", "said"),
+    ("command", "environment", "errors"),
     [
         (
             *("scripts/setup", {"MJREC_VENV": "mine"}),
@@ -92,7 +84,7 @@ def test_an_installation_is_repeated_only_where_it_must_be(checkout, tmp_path):
             *(f"{SOURCE} find_python", {"MJREC_PYTHON": "./old-python"}),
             ["Python 3.11 or 3.12", "./old-python is: Python 3.9.2", "MJREC_PYTHON="],
         ),
-        # Where packages may not be installed, one line does it.
+        # Without permission to install, the error has the line to run.
         (
             f"{SOURCE} may_install() {{ false; }}; in_package_lists() {{ false; }}; "
             "install_required $(missing_egl)",
@@ -105,8 +97,8 @@ def test_an_installation_is_repeated_only_where_it_must_be(checkout, tmp_path):
     ],
     ids=["foreign directory", "old Python", "no libraries", "failed step"],
 )
-def test_what_stops_a_command_is_named(checkout, command, environment, said):
-    """With what to do; a directory that the scripts did not make stays as it is."""
+def test_errors_name_reason_and_remedy(checkout, command, environment, errors):
+    """A directory that the scripts did not make stays as it is."""
     (checkout / "mine").mkdir()
     (checkout / "mine" / "thesis.tex").write_text("precious")
     old = checkout / "old-python"
@@ -114,13 +106,12 @@ def test_what_stops_a_command_is_named(checkout, command, environment, said):
     old.chmod(0o755)
     answer = bash(checkout, command, **environment)
     assert answer.returncode == 1
-    for words in said:
+    for words in errors:
         assert words in answer.stderr
     assert [path.name for path in (checkout / "mine").iterdir()] == ["thesis.tex"]
 
 
-def test_pull_requests_run_the_tests():
-    """The workflow runs the scripts that a contributor runs."""
+def test_workflow_runs_the_scripts_on_pull_requests():
     text = (ROOT / ".github" / "workflows" / "test.yml").read_text()
     [job] = yaml.safe_load(text)["jobs"].values()
     commands = [step["run"] for step in job["steps"] if "run" in step]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos have a second name where one was asked for, and nothing of anybody is lost."""
+"""Second names of videos."""
 
 import json
 import os
@@ -24,7 +24,7 @@ ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side
 
 @pytest.fixture
 def video(tmp_path):
-    """An episode with a further camera, as far as files go."""
+    """The files of an episode with a further camera."""
     return write_episode(tmp_path)
 
 
@@ -32,18 +32,18 @@ def write_episode(directory, **metadata):
     for name in (f"{STEM}.mp4", SIDE):
         (directory / name).write_bytes(name.encode())
     (directory / f"{STEM}.side.meta.json").write_text("{}")
-    said = {"also_named": f"{SECOND}.mp4", "further_videos": [SIDE], **metadata}
-    (directory / f"{STEM}.meta.json").write_text(json.dumps(said))
+    metadata = {"also_named": f"{SECOND}.mp4", "further_videos": [SIDE], **metadata}
+    (directory / f"{STEM}.meta.json").write_text(json.dumps(metadata))
     return directory / f"{STEM}.mp4"
 
 
-def seconds(directory):
+def second_names(directory):
     return sorted(p.name for p in directory.iterdir() if "openaigym" not in p.name)
 
 
 @pytest.mark.parametrize("has_hard_links", [True, False])
-def test_all_of_an_episode_has_a_second_name(video, monkeypatch, has_hard_links):
-    """Links, which take no room; one that is missing comes back."""
+def test_all_files_of_an_episode_have_second_names(video, monkeypatch, has_hard_links):
+    """A missing link is made again."""
 
     def refuse(*_):
         raise OSError("no links here")
@@ -53,34 +53,33 @@ def test_all_of_an_episode_has_a_second_name(video, monkeypatch, has_hard_links)
     give_second_names(video)
     video.with_name(ALL[0]).unlink()
     give_all_second_names(video.parent)
-    assert seconds(video.parent) == ALL
+    assert second_names(video.parent) == ALL
     assert video.with_name(f"{SECOND}.mp4").samefile(video)
     assert video.with_name(f"{SECOND}.mp4").is_symlink() != has_hard_links
     take_second_names(video)
-    assert seconds(video.parent) == []
+    assert second_names(video.parent) == []
     give_second_names(video)
     clear_monitor_files(video.parent)
     assert list(video.parent.iterdir()) == []
 
 
-def test_a_copy_without_hard_links_is_not_another_file(video, tmp_path, caplog):
-    """A copied directory needs no warning, and new videos replace the copies."""
+def test_copies_of_links_are_still_second_names(video, tmp_path, caplog):
+    """Copying a directory gives no warning, and the copies can be removed."""
     give_second_names(video)
     copied = tmp_path / "copy"
     shutil.copytree(tmp_path, copied)
     give_all_second_names(copied)
     assert not caplog.records
     take_second_names(copied / video.name)
-    assert seconds(copied) == []
+    assert second_names(copied) == []
 
 
-def test_somebody_elses_file_stays(video, caplog):
-    """It is said which one is in the way, and nobody removes it either."""
+def test_foreign_file_of_that_name_stays(video, caplog):
     mine = video.with_name(f"{SECOND}.mp4")
     mine.write_text("mine")
     give_second_names(video)
     assert f"{SECOND}.mp4 already exists" in caplog.text
-    assert seconds(video.parent) == ALL
+    assert second_names(video.parent) == ALL
     take_second_names(video)
     clear_monitor_files(video.parent)
     assert [path.name for path in video.parent.iterdir()] == [mine.name]
@@ -88,8 +87,8 @@ def test_somebody_elses_file_stays(video, caplog):
 
 
 @pytest.mark.parametrize("way", ["hardlink_to", "symlink_to"])
-def test_clearing_removes_links_to_the_files(way, video):
-    """Also where the metadata is gone that would say so; not other links."""
+def test_clearing_removes_links_to_videos(way, video):
+    """Links of other names stay."""
     getattr(video.with_name(f"{SECOND}.mp4"), way)(video)
     os.link(video, video.with_name("my favourite.mp4"))
     video.with_suffix(".meta.json").unlink()
@@ -98,11 +97,10 @@ def test_clearing_removes_links_to_the_files(way, video):
 
 
 @pytest.mark.parametrize("name", ["../x-episode-1.mp4", "openaigym.x-episode-1.mp4", 5])
-def test_a_name_that_is_none_is_passed_over(name, tmp_path, names):
-    """Metadata may be anybody's."""
+def test_invalid_second_name_is_ignored(name, tmp_path, names):
     (tmp_path / "recordings").mkdir()
     give_second_names(write_episode(tmp_path / "recordings", also_named=name))
-    assert seconds(tmp_path / "recordings") == []
+    assert second_names(tmp_path / "recordings") == []
     assert names(tmp_path) == ["recordings"]
 
 
@@ -110,8 +108,7 @@ def test_a_name_that_is_none_is_passed_over(name, tmp_path, names):
     "name",
     ["x.mp4", f"{STEM}.mp4/../x.mp4", 7, f"{STEM}.gone.mp4", f"{STEM[:-1]}8.side.mp4"],
 )
-def test_only_files_of_the_episode_are_its_videos(name, tmp_path):
-    """And only those that are there."""
+def test_further_videos_are_existing_files_of_the_episode(name, tmp_path):
     (tmp_path / "x.mp4").write_text("")
     assert finished_videos(write_episode(tmp_path, further_videos=[name, SIDE])) == [
         (f"{STEM}.mp4", f"{STEM}.meta.json"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions whose frames are drawn later, by others, or not at all."""
+"""Recording sessions whose frames are drawn later, elsewhere, or never."""
 
 import importlib.util
 import json
@@ -21,7 +21,6 @@ from mjrec.sessions import Session, record_session
 
 
 def session(directory, *, name="InvertedPendulum-v5", episodes=1, **options):
-    """Return a session of two steps an episode, with options of its monitor."""
     return Session(
         environment=name,
         directory=directory,
@@ -34,8 +33,6 @@ def session(directory, *, name="InvertedPendulum-v5", episodes=1, **options):
 
 @pytest.fixture
 def no_gl(monkeypatch):
-    """Let no OpenGL backend be found."""
-
     def fail():
         raise GLError("Nothing renders here.")
 
@@ -44,20 +41,19 @@ def no_gl(monkeypatch):
 
 @pytest.mark.usefixtures("no_gl")
 @pytest.mark.parametrize("options", [{"workers": 0}, {"render": "off"}])
-def test_what_is_not_drawn_here_looks_for_no_gl(options, tmp_path):
-    """The states are recorded, and the videos are promised, or not wanted."""
+def test_deferred_drawing_needs_no_gl(options, tmp_path):
     [episode] = record_session(session(tmp_path, **options))
-    promised = [entry["video"] for entry in manifest_of(tmp_path)["mjrec"]["pending"]]
-    assert promised == ([] if episode.video is None else [episode.video.name])
-    assert len(promised) == ("workers" in options)
+    pending = [entry["video"] for entry in manifest_of(tmp_path)["mjrec"]["pending"]]
+    assert pending == ([] if episode.video is None else [episode.video.name])
+    assert len(pending) == ("workers" in options)
     assert videos_in(tmp_path) == []
     assert len(list(tmp_path.glob("*.trajectory.*"))) == 1
 
 
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
-def test_without_gl_the_way_out_is_named(tmp_path, render):
-    """Where the frames could be drawn elsewhere; nothing is written."""
+def test_missing_gl_error_suggests_deferred_drawing(tmp_path, render):
+    """For live frames there is no such advice."""
     out = tmp_path / "out"
     with pytest.raises(GLError, match="Nothing renders here") as raised:
         list(record_session(session(out, render=render)))
@@ -69,12 +65,11 @@ def test_without_gl_the_way_out_is_named(tmp_path, render):
 RECORD = ("record", "InvertedPendulum-v5", "--size", "32x32", "--max-steps", "9")
 
 
-def test_record_says_which_videos_are_pending(tmp_path, capsys):
-    """And what makes them; also for programs."""
+def test_record_lists_pending_videos_and_their_command(tmp_path, capsys):
     command = [*RECORD, "--seed", "0", "--workers", "0", "--force", "--out"]
     assert main([*command, str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert f"000000.mp4  (pending: mjrec render {tmp_path})" in said
+    printed = capsys.readouterr().out
+    assert f"000000.mp4  (pending: mjrec render {tmp_path})" in printed
     assert main([*command, str(tmp_path), "--json"]) == 0
     [episode] = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["pending"] is True
@@ -84,27 +79,24 @@ def test_record_says_which_videos_are_pending(tmp_path, capsys):
     importlib.util.find_spec("pygame") is not None, reason="pygame is installed"
 )
 @pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
-def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, caplog):
-    """CartPole needs pygame: one line says so, unless frames were asked for."""
-    asked = replace(
+def test_environment_that_cannot_be_drawn_gives_statistics(options, tmp_path, caplog):
+    """One line says that CartPole needs pygame; requested frames are an error."""
+    cart_pole = replace(
         session(tmp_path, name="CartPole", episodes=2, **options),
         made=EnvironmentOptions(max_steps=2),
     )
-    assert [each.video for each in record_session(asked)] == [None, None]
+    assert [each.video for each in record_session(cart_pole)] == [None, None]
     assert mjrec.load_results(tmp_path)["episode_lengths"] == [2, 2]
     [line] = caplog.messages
     assert "only statistics, no videos. Drawing CartPole-v1 needs pygame" in line
-    live = replace(asked, monitor=RecorderOptions(render="live", force=True))
+    live = replace(cart_pole, monitor=RecorderOptions(render="live", force=True))
     with pytest.raises(mjrec.MissingDependency, match="pygame"):
         list(record_session(live))
 
 
-def test_record_chooses_a_backend_before_mujoco_is_loaded(tmp_path):
-    """Where `MUJOCO_GL` says nothing, MuJoCo would take one that needs a screen."""
+def test_record_chooses_a_backend_before_importing_mujoco(tmp_path):
+    """MuJoCo alone would choose one that needs a screen."""
     environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
-    subprocess.run(
-        [sys.executable, "-m", "mjrec", *RECORD, "--out", str(tmp_path)],
-        env=environ,
-        check=True,
-    )
+    command = [sys.executable, "-m", "mjrec", *RECORD, "--out", str(tmp_path)]
+    subprocess.run(command, env=environ, check=True)
     assert videos_in(tmp_path)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in a monitor's row logs are there whatever becomes of the process."""
+"""Recordings in row logs survive the death of their process."""
 
 import itertools
 import os
+import re
 import signal
 import struct
 from pathlib import Path
@@ -29,13 +30,11 @@ ROW, CAPACITY = DTYPE.itemsize, 8
 
 @pytest.fixture
 def path(tmp_path):
-    """The file that the recording will be."""
     return tmp_path / f"{NAME}.h5"
 
 
 @pytest.fixture
 def logs(tmp_path):
-    """Logs whose tails hold eight rows."""
     return new_logs(tmp_path, INFIX, tail_bytes=CAPACITY * ROW)
 
 
@@ -49,27 +48,26 @@ def episode(directory, number):
 
 
 def files_of(directory):
-    """Return the journal, and the only log there is, its tail and its changes."""
+    """Return the paths of the journal, the only log, its tail and its changes."""
     [log] = spans.log_paths(directory)
     journal = directory / journal_name(INFIX)
     return journal, log, tail_path(log), log.with_suffix(".looks")
 
 
-def change(step, **fields):
+def model_change(step, **fields):
     return ModelChange(step=step, fields=fields or {"a": np.ones(2)})
 
 
-@pytest.fixture(params=[True, False], ids=["a mapped tail", "no tail"])
+@pytest.fixture(params=[True, False], ids=["mapped tail", "no tail"])
 def mapped(request, monkeypatch):
-    """Whether the file system has mappings that outlive a process."""
     monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: request.param)
     return request.param
 
 
-def test_rows_are_there_as_soon_as_they_are_counted(logs, path, mapped):
-    """Wherever the tail wraps, also for an open reader; then the log is alone."""
+def test_counted_rows_are_readable_at_once(logs, path, mapped):
+    """An open reader keeps its rows; closing leaves only the log."""
     span = write(logs, 2)
-    found, log, tail, _ = files_of(path.parent)
+    journal, log, tail, _ = files_of(path.parent)
     assert tail.exists() == mapped
     with open_recording(path) as reader:
         for step in range(3, 3 * CAPACITY + 5):
@@ -81,15 +79,15 @@ def test_rows_are_there_as_soon_as_they_are_counted(logs, path, mapped):
         check(content_of(reader), 2)
     check(read(path), step)
     assert log.stat().st_size == (step + 1) * ROW
-    assert sorted(path.parent.iterdir()) == sorted([found, log])
+    assert sorted(path.parent.iterdir()) == sorted([journal, log])
 
 
-def test_recordings_of_one_log_come_back_bit_for_bit(logs, tmp_path):
-    """Each has its own rows and facts, ended or not; the last is written still."""
+def test_one_log_returns_several_recordings_bit_for_bit(logs, tmp_path):
+    """Each has its own rows and facts, whether it ended or not."""
     lengths = [3, 0, 17, 40, 2]
-    said = [{**FACTS, "number": 0}, {"number": 1}, {}, {**FACTS, "seed": 8}, FACTS]
+    facts = [{**FACTS, "number": 0}, {"number": 1}, {}, {**FACTS, "seed": 8}, FACTS]
     for number, steps in enumerate(lengths):
-        span = write(logs, steps, episode=number, every=2, facts=said[number])
+        span = write(logs, steps, episode=number, every=2, facts=facts[number])
         if number % 2:
             span.end({"complete": True})
     for _ in range(2):
@@ -99,28 +97,21 @@ def test_recordings_of_one_log_come_back_bit_for_bit(logs, tmp_path):
             content = read(found[number].path)
             check(content, steps, every=2)
             ending = {"complete": True} if number % 2 else {}
-            assert (content.facts, content.dropped) == ({**said[number], **ending}, 0)
+            assert (content.facts, content.dropped) == ({**facts[number], **ending}, 0)
         assert len(list(spans.log_paths(tmp_path))) == 1
         logs.close()
 
 
-def test_model_changes_come_back(logs, path):
-    """Names, kinds and values; of a row that was never counted there is none."""
-    fields = {
-        "geom_rgba": np.arange(8, dtype=np.float32).reshape(2, 4),
-        "stat.extent": np.float64(2.5),
-        "mat_texid": np.array([[1, 2]], ">i4"),
-        "eq_active": np.array([True]),
-        "hfield_data": np.empty((0, 3), np.float32),
-    }
+def test_model_changes_belong_to_counted_rows(logs, path):
+    fields = {"mat_texid": np.array([[1, 2]], ">i4"), "eq_active": np.array([True])}
     span = logs.begin(path.stem, FACTS, DTYPE)
-    span.log.add_change(change(0, **fields))
+    span.log.add_change(model_change(0, **fields))
     add_row(span, 0)
-    span.log.add_change(change(1))
+    span.log.add_change(model_change(1))
     [first] = read(path).model_changes
     add_row(span, 1)
     other = logs.begin(trajectory_prefix(INFIX, 28), FACTS, DTYPE)
-    other.log.add_change(change(0, b=np.ones(1)))
+    other.log.add_change(model_change(0, b=np.ones(1)))
     add_row(other, 0)
     assert [list(c.fields) for c in read(path).model_changes] == [[*fields], ["a"]]
     [last] = read(episode(path.parent, 28)).model_changes
@@ -130,8 +121,8 @@ def test_model_changes_come_back(logs, path):
         np.testing.assert_array_equal(first.fields[name], little, strict=True)
 
 
-def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
-    """With all changes to the model, though the tail wraps with every fourth row."""
+def test_reader_sees_whole_recordings_beside_a_writer(tmp_path):
+    """The tail wraps with every fourth row."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record():
@@ -141,7 +132,7 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
             if step % 100 == 0:
                 if step >= 1000 and enough.exists():
                     break
-                span.log.add_change(change(step))
+                span.log.add_change(model_change(step))
             add_row(span, step, state=step, reward=step)
         span.end({"complete": True, "rows": step})
         logs.close()
@@ -175,7 +166,7 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
 
 
 def die_writing(function, part, number=1):
-    """Have the Nth call of `os.write` or `os.pwrite` write a part, and die."""
+    """Let the Nth call of `os.write` or `os.pwrite` write a part and die."""
     real, calls = getattr(os, function), itertools.count(1)
 
     def write_part(descriptor, data, *offset):
@@ -199,23 +190,20 @@ def die_in_close(rows):
 
 
 MOMENTS = {
-    # With some rows of a full tail in the log, and half of one.
-    "in the middle of a write": (
+    "within a write": (
         3 * CAPACITY,
         lambda _: die_writing("pwrite", lambda data: data[: len(data) // 2 - 3]),
     ),
-    # With a full tail in the log, which is not noted yet.
+    # The tail is in the log, which is not noted yet.
     "after a write": (3 * CAPACITY, lambda _: die_writing("pwrite", bytes)),
-    # When the first slot of a tail that was written is filled again.
-    "in the next slot": (3 * CAPACITY, die_in_slot),
-    # With all rows in the log, before the tail is removed.
-    "in a close": (3 * CAPACITY + 2, die_in_close),
+    "refilling the first slot": (3 * CAPACITY, die_in_slot),
+    # All rows are in the log; the tail still exists.
+    "in close": (3 * CAPACITY + 2, die_in_close),
 }
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_killed_process_loses_no_counted_row(logs, path, mapped, moment):
-    """At any moment; nothing was flushed, and no signal's handler was called."""
+def test_killed_process_loses_no_counted_row(logs, path, mapped, moment):
     count, die = MOMENTS[moment]
 
     def record(tell):
@@ -229,13 +217,12 @@ def test_a_killed_process_loses_no_counted_row(logs, path, mapped, moment):
     steps, status = forked(record)
     assert os.WTERMSIG(status) == signal.SIGKILL
     assert steps >= 3 * CAPACITY - 1
-    # Without a tail a row counts as soon as it is in the log.
+    # Without a tail, a row counts once it is in the log.
     check(read(path), steps + (not mapped and moment == "after a write"))
 
 
 @pytest.mark.parametrize("written", [0, 5, 8 * ROW])
-def test_an_interrupted_write_is_taken_up_again(logs, path, monkeypatch, written):
-    """After Ctrl-C at any byte of it; each row is there once."""
+def test_interrupted_write_continues(logs, path, monkeypatch, written):
     last = 2 * CAPACITY - 1
     span = write(logs, last)
     real = os.pwrite
@@ -260,10 +247,7 @@ def test_an_interrupted_write_is_taken_up_again(logs, path, monkeypatch, written
     ids=["nothing", "half", "all but the last byte", "all"],
 )
 @pytest.mark.parametrize("line", range(1, 6))
-def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
-    logs, tmp_path, line, part
-):
-    """What was recorded before is there; what was being said is said or is not."""
+def test_death_in_a_journal_line_loses_only_that_line(logs, tmp_path, line, part):
 
     def record(tell):
         die_writing("write", part, line)
@@ -277,28 +261,27 @@ def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
     assert recorded == (line - 1) // 2
     found = {each.name: each.path for each in spans.recordings_in_flight(tmp_path)}
     lines = ["rows", "begin 0", "end 0", "begin 1", "end 1"]
-    said = lines[: line - (part is not bytes)]
+    written = lines[: line - (part is not bytes)]
     for number in range(2):
         name = trajectory_prefix(INFIX, number)
-        assert (name in found) == (f"begin {number}" in said)
+        assert (name in found) == (f"begin {number}" in written)
         if number < recorded:
             content = read(found[name])
             check(content, 5)
-            assert ("complete" in content.facts) == (f"end {number}" in said)
-    # A recovery goes on in that journal.
+            assert ("complete" in content.facts) == (f"end {number}" in written)
+    # A recovery appends to that journal, which completes a line without a newline.
     for each in found.values():
         add_facts(each, {"later": 1})
         assert read(each).facts["later"] == 1
     for number in range(2):
-        # Also one whose line lacked its end only, which it has by now.
         drop(episode(tmp_path, number))
     for left in spans.log_paths(tmp_path):
         spans.remove_if_done(left)
     assert [path.suffix for path in tmp_path.iterdir()] == [".jsonl"]
 
 
-def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
-    """Cut at every word, also while it is read; rows of something else are an error."""
+def test_truncated_log_reports_lost_rows(logs, path):
+    """Other rows in their place are an error."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -318,12 +301,11 @@ def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
 
 
 BAD_TAILS = {
-    # What it says would lead beyond it, or to rows of another size.
     "short": lambda *_: struct.pack("=2Q", 19, ROW // 8),
-    "of other rows": lambda *_: tail_head(19, ROW // 8 + 1, CAPACITY),
-    "beyond its end": lambda *_: tail_head(19, ROW // 8, CAPACITY + 1),
-    "without rows": lambda *_: tail_head(19, ROW // 8, 0),
-    # Its pages are older than the log, or never were written.
+    "other row size": lambda *_: tail_head(19, ROW // 8 + 1, CAPACITY),
+    "too many rows": lambda *_: tail_head(19, ROW // 8, CAPACITY + 1),
+    "no rows": lambda *_: tail_head(19, ROW // 8, 0),
+    # Pages that are older than the log, or were never written.
     "zeros": lambda _, newer: bytes(len(newer)),
     "older": lambda older, _: older,
     "zeros behind the head": lambda _, newer: newer[:4096].ljust(len(newer), b"\0"),
@@ -335,23 +317,21 @@ def tail_head(*words):
 
 
 @pytest.mark.parametrize("tail", BAD_TAILS)
-def test_a_tail_of_something_else_or_older_ends_a_recording(logs, path, tail):
-    """No row is invented."""
+def test_stale_or_foreign_tail_adds_no_row(logs, path, tail):
     span = write(logs, 12)
     file = files_of(path.parent)[2]
     older = file.read_bytes()
     write(logs, 18, first=13, span=span)
     newer = file.read_bytes()
     logs.release()
-    # The log has rows 0 to 15, the tail of 8 rows those from 16 on.
+    # The log has rows 0 to 15, the tail those from 16 on.
     file.write_bytes(BAD_TAILS[tail](older, newer))
     content = read(path)
     check(content, 15)
     assert content.dropped == (3 if tail == "zeros behind the head" else 0)
 
 
-def test_a_full_disk_when_a_log_is_made_leaves_nothing(logs, path):
-    """Its tail finds no room, or the journal; with room again it is begun."""
+def test_full_disk_when_a_log_begins_leaves_nothing(logs, path):
     long = {"text": "x" * 20_000}
     for room, facts in ((0, FACTS), (100, FACTS), (4096, FACTS), (9000, long)):
         with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
@@ -362,11 +342,11 @@ def test_a_full_disk_when_a_log_is_made_leaves_nothing(logs, path):
 
 
 @pytest.mark.parametrize("room", [0, 30])
-def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
-    """The journal stays as it was; an end may stand behind the next beginning."""
+def test_journal_lines_wait_for_room_on_a_full_disk(logs, path, room):
+    """The journal stays as it was; an end may follow the next beginning."""
     span = write(logs, 3)
-    found, *_ = files_of(path.parent)
-    before = found.read_bytes()
+    journal, *_ = files_of(path.parent)
+    before = journal.read_bytes()
     with file_size_limit(len(before) + room):
         for fail in (
             lambda: add_facts(path, {"candidate": False, "text": "x" * 100}),
@@ -374,9 +354,9 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
             lambda: span.end({"complete": True}),
             lambda: logs.begin("x", FACTS, DTYPE),
         ):
-            with pytest.raises(FileNotWritten, match=rf"{found.name}: "):
+            with pytest.raises(FileNotWritten, match=rf"{journal.name}: "):
                 fail()
-        assert found.read_bytes() == before
+        assert journal.read_bytes() == before
         check(read(path), 3)
     write(logs, 5, episode=28)
     content = read(path)
@@ -386,8 +366,8 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
     check(read(episode(path.parent, 28)), 5)
 
 
-def test_a_full_disk_costs_no_step_that_was_recorded(logs, path, mapped):
-    """The step without room is refused, or kept in memory; with room all goes on."""
+def test_full_disk_costs_no_recorded_step(logs, path, mapped):
+    """The step without room is refused or kept in memory."""
     span = write(logs, 3)
     with file_size_limit(6000):
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):
@@ -404,15 +384,14 @@ def test_a_full_disk_costs_no_step_that_was_recorded(logs, path, mapped):
     check(read(path), recorded + 8)
 
 
-def test_a_change_on_a_full_disk_can_be_added_again(logs, path):
-    """The error names the file; what was added before stays, and nothing of this."""
+def test_model_change_can_be_added_again_after_a_full_disk(logs, path):
     span = write(logs, 1)
-    span.log.add_change(change(2))
+    span.log.add_change(model_change(2))
     write(logs, 2, first=2, span=span)
     *_, looks = files_of(path.parent)
-    texture = change(3, tex_data=np.zeros(3 << 20, np.uint8))
-    said = pytest.raises(FileNotWritten, match=rf"{looks.name}: ")
-    with file_size_limit(looks.stat().st_size + 40), said:
+    texture = model_change(3, tex_data=np.zeros(3 << 20, np.uint8))
+    error = pytest.raises(FileNotWritten, match=rf"{looks.name}: ")
+    with file_size_limit(looks.stat().st_size + 40), error:
         span.log.add_change(texture)
     span.log.add_change(texture)
     write(logs, 3, first=3, span=span)
@@ -421,13 +400,13 @@ def test_a_change_on_a_full_disk_can_be_added_again(logs, path):
     assert [list(each.fields) for each in found] == [["a"], ["tex_data"]]
 
 
-def test_a_log_ends_where_the_next_rows_do_not_belong(logs, tmp_path, monkeypatch):
-    """Of another kind, to be deleted alone, or behind many; changes count as rows."""
+def test_new_log_begins_for_other_rows_and_long_logs(logs, tmp_path, monkeypatch):
+    """Each recording that may be deleted alone has its own log."""
     other = row_dtype(state=STATE, action=np.dtype(("<i4", ACTION.shape)))
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
     write(logs, 5, episode=0)
     write(logs, 5, episode=1)
-    write(logs, 0, episode=2).log.add_change(change(1, t=np.zeros(2 * ROW)))
+    write(logs, 0, episode=2).log.add_change(model_change(1, t=np.zeros(2 * ROW)))
     write(logs, 0, episode=3)
     write(logs, 0, episode=4, dtype=other)
     for number in (5, 6, 7):
@@ -444,9 +423,9 @@ def test_a_log_ends_where_the_next_rows_do_not_belong(logs, tmp_path, monkeypatc
     check(read(episode(tmp_path, 4)), 0, dtype=other)
 
 
-def test_a_log_of_which_nothing_is_needed_is_removed(logs, tmp_path):
-    """With its files, when the last of its recordings is dropped, a file, a video."""
-    write(logs, 3, episode=0).log.add_change(change(4))
+def test_log_is_removed_after_its_last_recording(logs, tmp_path):
+    """A recording is done when it is dropped, has its file or has its video."""
+    write(logs, 3, episode=0).log.add_change(model_change(4))
     video = {"kept": False, "video": {"name": "v.mp4"}}
     paths = [episode(tmp_path, number) for number in range(4)]
     for number, facts in enumerate([FACTS, FACTS, video], start=1):
@@ -467,8 +446,8 @@ def test_a_log_of_which_nothing_is_needed_is_removed(logs, tmp_path):
     assert list(tmp_path.glob("openaigym.states.*")) == []
 
 
-def test_a_log_that_an_open_monitor_writes_is_not_removed(logs, path, monkeypatch):
-    """Its next recording goes there; also one that begins while it is looked at."""
+def test_log_of_an_open_monitor_is_not_removed(logs, path, monkeypatch):
+    """A recording may begin during the check."""
     lock = Lock(path.parent / lock_name(INFIX), "")
     write(logs, 3)
     drop(path)
@@ -491,8 +470,8 @@ def test_a_log_that_an_open_monitor_writes_is_not_removed(logs, path, monkeypatc
 
 
 @pytest.mark.parametrize("more", [-1, 1])
-def test_a_journal_by_the_name_of_one_that_was_removed_is_another(tmp_path, more):
-    """As where `force` empties a directory; shorter or longer."""
+def test_new_journal_replaces_a_removed_one_of_the_same_name(tmp_path, more):
+    """`force` empties a directory like this."""
     for number in range(4):
         logs, count = new_logs(tmp_path, INFIX), 4 + more * number
         for each in range(count):
@@ -507,23 +486,20 @@ def test_a_journal_by_the_name_of_one_that_was_removed_is_another(tmp_path, more
 
 
 @pytest.mark.parametrize(
-    ("said", "reason"),
+    ("old", "new", "reason"),
     [
-        (
-            lambda text: text.replace(b'"version": 1', b'"version": 9'),
-            "newer mjrec in format version 9",
-        ),
-        (lambda _: b'{"rows": 3}\n{"begin": 4}\n', "no journal gives the layout"),
-        (None, "no journal gives the layout"),
+        (rb'"version": 1', b'"version": 9', "newer mjrec in format version 9"),
+        (b"(?s).+", b'{"rows": 3}\n{"begin": 4}\n', "no journal gives the layout"),
+        (b"(?s).+", b"", "no journal gives the layout"),
     ],
     ids=["newer", "damaged", "gone"],
 )
-def test_rows_that_no_journal_describes_stay(logs, path, said, reason):
-    """In the tail as in the log; the error says why where they are asked for."""
+def test_rows_without_a_readable_journal_stay(logs, path, old, new, reason):
     write(logs, 3)
     journal, log, *_ = files_of(path.parent)
-    text = journal.read_bytes()
-    journal.unlink() if said is None else journal.write_bytes(said(text))
+    journal.write_bytes(re.sub(old, new, journal.read_bytes()))
+    if not new:
+        journal.unlink()
     with pytest.raises(UnreadableFile, match=reason):
         spans.recordings_in(log)
     logs.release()
@@ -531,10 +507,8 @@ def test_rows_that_no_journal_describes_stay(logs, path, said, reason):
     assert log.exists()
 
 
-def test_files_that_are_removed_while_they_are_written_cost_one_recording(
-    logs, tmp_path
-):
-    """The next one begins another log and another journal, which says all again."""
+def test_removing_open_files_costs_one_recording(logs, tmp_path):
+    """The next recording begins another log and a complete journal."""
     write(logs, 3, episode=0)
     for file in files_of(tmp_path):
         file.unlink(missing_ok=True)

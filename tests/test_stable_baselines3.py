@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""With the real Stable-Baselines3: training, its vector environments, its readers."""
+"""Training with Stable-Baselines3: vector environments, evaluation, result readers."""
 
 import importlib.util
 import json
@@ -16,10 +16,10 @@ import mjrec
 from mjrec.trackers import MonitorCsvTracker, Run
 
 if importlib.util.find_spec("stable_baselines3") is None:
-    # Where it is named on the command line, in spite of conftest.py.
+    # Naming this file bypasses conftest.py's `collect_ignore`.
     pytest.skip("scripts/test --all installs it", allow_module_level=True)
 
-# Before pyplot, which would look for a display.
+# Before pyplot looks for a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import torch
@@ -29,24 +29,18 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files, load_re
 from stable_baselines3.common.results_plotter import ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-pytestmark = [
-    pytest.mark.stable_baselines3,
-    # Beyond it, something waits for something that never comes.
-    pytest.mark.timeout(120),
-]
+pytestmark = [pytest.mark.stable_baselines3, pytest.mark.timeout(120)]
 
 STEPS = 256
 
-# Many times as fast for so small a network, where the cores are busy.
+# Far faster for small networks on busy cores.
 torch.set_num_threads(1)
 
 
 def make_env(directory, *, steps=20, **options):
-    """Return a monitored pendulum; its frames are drawn later."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps)
-    return mjrec.Monitor(
-        env, directory, width=48, height=32, render="deferred", **options
-    )
+    view = {"width": 48, "height": 32, "render": "deferred"}
+    return mjrec.Monitor(env, directory, **view, **options)
 
 
 def make_ppo(env):
@@ -60,74 +54,62 @@ def rewards_in(directory):
 
 
 def test_training_is_recorded(tmp_path):
-    """Every episode, with its videos; the algorithm sees the same returns."""
-    env = make_env(
-        tmp_path, video_callable=lambda n: n in (0, 3), trackers=MonitorCsvTracker()
-    )
-    with env:
+    """The algorithm's returns equal those in the journal and in monitor.csv."""
+    options = {"video_callable": lambda n: n in (0, 3), "trackers": MonitorCsvTracker()}
+    with make_env(tmp_path, **options) as env:
         model = make_ppo(env).learn(STEPS)
-    seen = [one["r"] for one in model.ep_info_buffer]
-    assert len(seen) > 5
-    assert rewards_in(tmp_path) == pytest.approx(seen)
+    returns = [info["r"] for info in model.ep_info_buffer]
+    assert len(returns) > 5
+    assert rewards_in(tmp_path) == pytest.approx(returns)
     assert videos_in(tmp_path) == [0, 3]
     assert metadata_of(tmp_path, 3)["recording"] == "deferred"
     assert manifest_of(tmp_path)["mjrec"]["pending"] == []
     read = load_results(str(tmp_path))
     assert list(read["r"]) == rewards_in(tmp_path)
-    # Without the steps of the last episode, which did not end.
+    # The last episode did not end, so its steps are missing.
     steps, returns = ts2xy(read, "timesteps")
     assert steps[-1] == sum(entry["length"] for entry in journal_of(tmp_path)) <= STEPS
     assert list(returns) == rewards_in(tmp_path)
 
 
-def test_episode_info_is_what_stable_baselines3_logs(tmp_path):
-    """Without a monitor of its own around, as in a vector environment."""
-    venv = DummyVecEnv(
-        [lambda: make_env(tmp_path, episode_info=True, video_callable=False)]
-    )
+def test_stable_baselines3_logs_episode_info(tmp_path):
+    options = {"episode_info": True, "video_callable": False}
+    venv = DummyVecEnv([lambda: make_env(tmp_path, **options)])
     model = make_ppo(venv).learn(STEPS)
     venv.close()
-    seen = [one["r"] for one in model.ep_info_buffer]
-    assert len(seen) > 5
-    assert rewards_in(tmp_path) == pytest.approx(seen)
+    returns = [info["r"] for info in model.ep_info_buffer]
+    assert len(returns) > 5
+    assert rewards_in(tmp_path) == pytest.approx(returns)
 
 
-# From Python 3.12 on, `fork` beside any thread is warned of: torch's, for instance.
+# From Python 3.12 on, `fork` beside torch's threads warns.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 @pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver", "fork"])
-def test_each_environment_of_a_vector_has_its_monitor(kind, tmp_path):
-    """All in one directory; what was chosen is there as a video after `close`."""
+def test_monitors_in_a_vector_environment_share_a_directory(kind, tmp_path):
+    """Scheduled videos are there after `close`."""
 
     def make(index):
-        # Sent to another process as code: nothing of this module may be named in it.
+        # Pickled into another process, which cannot import this module.
         def make_monitored():
             import gymnasium
 
             import mjrec
 
             env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=20)
-            return mjrec.Monitor(
-                env,
-                directory,
-                lambda number: number in (0, 2),
-                resume=True,
-                uid=f"env{index}",
-                width=48,
-                height=32,
-                render="deferred",
-                workers=1,
-                allow_early_reset=True,
-            )
+            options = {"resume": True, "uid": f"env{index}", "workers": 1}
+            options |= {"allow_early_reset": True, "render": "deferred"}
+            options |= {"width": 48, "height": 32}
+            return mjrec.Monitor(env, directory, lambda n: n in (0, 2), **options)
 
         return make_monitored
 
     directory = str(tmp_path / "recordings")
     functions = [make(index) for index in range(2)]
-    venv = VecMonitor(
-        DummyVecEnv(functions)
-        if kind == "dummy"
-        else SubprocVecEnv(functions, start_method=kind)
-    )
+    if kind == "dummy":
+        venv = DummyVecEnv(functions)
+    else:
+        venv = SubprocVecEnv(functions, start_method=kind)
+    venv = VecMonitor(venv)
     model = make_ppo(venv).learn(STEPS)
     venv.close()
     manifests = list((tmp_path / "recordings").glob("*.manifest.json"))
@@ -142,29 +124,25 @@ def test_each_environment_of_a_vector_has_its_monitor(kind, tmp_path):
     )
 
 
-def test_own_monitor_outside_agrees(tmp_path):
-    """Its file and ours say the same, but for its six digits."""
-    env = make_env(
-        tmp_path / "ours", video_callable=False, trackers=MonitorCsvTracker()
-    )
+def test_monitor_csv_equals_that_of_stable_baselines3(tmp_path):
+    options = {"video_callable": False, "trackers": MonitorCsvTracker()}
+    env = make_env(tmp_path / "ours", **options)
     with Monitor(env, str(tmp_path / "theirs" / "0")) as outer:
         make_ppo(outer).learn(STEPS)
     (ours, theirs) = (load_results(str(tmp_path / name)) for name in ("ours", "theirs"))
     assert list(ours["r"]) == pytest.approx(list(theirs["r"]), abs=1e-6)
     assert list(ours["l"]) == list(theirs["l"])
-    # Its own reader finds both.
     assert len(get_monitor_files(str(tmp_path / "ours"))) == 1
     assert np.allclose(ours["t"], theirs["t"], atol=0.5)
 
 
 def test_evaluation_is_recorded(tmp_path):
-    """The returns that `evaluate_policy` gives are those in the directory."""
+    """The returns of `evaluate_policy` equal those in the journal."""
     model = make_ppo(gymnasium.make("InvertedPendulum-v5"))
     options = {"mode": "evaluation", "video_callable": lambda number: number == 1}
     with make_env(tmp_path, **options) as env:
-        returns, lengths = evaluate_policy(
-            model, env, 3, return_episode_rewards=True, warn=False
-        )
+        both = {"return_episode_rewards": True, "warn": False}
+        returns, lengths = evaluate_policy(model, env, 3, **both)
     assert rewards_in(tmp_path) == pytest.approx(returns)
     assert [entry["length"] for entry in journal_of(tmp_path)] == lengths
     assert {entry["type"] for entry in journal_of(tmp_path)} == {"e"}
@@ -172,7 +150,7 @@ def test_evaluation_is_recorded(tmp_path):
 
 
 def test_files_of_several_runs_are_read_together(tmp_path):
-    """In the order of the ends; NaN and infinity too, and a run without episodes."""
+    """They are in the order of their ends."""
     tracker = MonitorCsvTracker()
     runs = [
         Run(directory=tmp_path, infix=f"{i}.1", env_id="x", env_index=i)
@@ -181,10 +159,9 @@ def test_files_of_several_runs_are_read_together(tmp_path):
     for run in runs:
         tracker.begin(run)
     start = episode().end_time
-    for second, (which, reward) in enumerate(
-        [(1, 1.0), (0, math.nan), (1, math.inf), (0, -2.5)]
-    ):
-        tracker.episode(runs[which], episode(reward=reward, end_time=start + second))
+    ends = [(1, 1.0), (0, math.nan), (1, math.inf), (0, -2.5)]
+    for second, (index, reward) in enumerate(ends):
+        tracker.episode(runs[index], episode(reward=reward, end_time=start + second))
     for run in runs:
         tracker.end(run)
     read = load_results(str(tmp_path))

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""`StatsRecorder` writes statistics of complete episodes."""
+
 import json
 import math
 import time
@@ -25,7 +27,6 @@ def run_episode(recorder, rewards, *, end=True):
 
 
 def test_only_complete_episodes_are_written(recorder):
-    """With length, return, type and wall clock; a closed recorder refuses."""
     with pytest.raises(ResetNeeded, match="Env-v0 before the first reset"):
         recorder.before_step(None)
     before = time.time()
@@ -47,13 +48,12 @@ def test_only_complete_episodes_are_written(recorder):
     ("rewards", "total"),
     [
         ([1, np.array([1.0]), np.array(1), np.int8(1), True], 5.0),
-        # In float32 the ones would be lost.
+        # float32 would lose the ones.
         ([np.float32(1e8), np.float32(1), np.float32(1)], 1e8 + 2),
         *(([value], value) for value in (math.nan, math.inf, -math.inf)),
     ],
 )
 def test_rewards_add_up_in_float64(recorder, rewards, total):
-    """Whatever kind of number they are; the file is JSON, and gives them back."""
     run_episode(recorder, rewards)
     recorder.close()
     json.loads(Path(recorder.path).read_text(), parse_constant=pytest.fail)
@@ -61,8 +61,7 @@ def test_rewards_add_up_in_float64(recorder, rewards, total):
     assert read == pytest.approx((total,), nan_ok=True, abs=0, rel=0)
 
 
-def test_a_type_takes_effect_at_the_next_reset(recorder):
-    """Types stay aligned with the completed episodes; there are two."""
+def test_type_takes_effect_at_the_next_reset(recorder):
     run_episode(recorder, [0.0], end=False)
     recorder.type = "e"
     recorder.after_step(None, 0.0, True, {})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long something may make no progress."""
+"""Timeouts without progress."""
 
 import time
 
@@ -9,8 +9,8 @@ from mjrec import InvalidArgument
 from mjrec.timeouts import Timeout, timeout_s
 
 
-def test_the_environment_variable_counts(monkeypatch):
-    """Two minutes without it; what is no time is an error that names it."""
+def test_environment_variable_sets_the_timeout(monkeypatch):
+    """The default is two minutes; an invalid value is an error that names it."""
     monkeypatch.delenv("MJREC_TIMEOUT", raising=False)
     assert timeout_s() == 120
     monkeypatch.setenv("MJREC_TIMEOUT", "2.5")
@@ -21,8 +21,8 @@ def test_the_environment_variable_counts(monkeypatch):
             timeout_s()
 
 
-def test_who_was_stopped_counts_no_more_than_he_was_to_wait(monkeypatch):
-    """Sleeping for an hour makes nothing hang; progress gives the time anew."""
+def test_time_asleep_does_not_count(monkeypatch):
+    """An hour asleep counts as one wait; progress restarts the timeout."""
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     timeout = Timeout(120)

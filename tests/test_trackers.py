@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the trackers have in common, and `monitor.csv`, as text."""
+"""Importing trackers, and `monitor.csv` as text."""
 
 import dataclasses
 import json
@@ -17,8 +17,7 @@ from mjrec.errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from mjrec.trackers import MonitorCsvTracker, Run
 
 
-def test_import_loads_no_service():
-    """Nor does importing each tracker."""
+def test_import_loads_no_service_package():
     answer = run_python(
         "import sys; from mjrec.trackers import *; "
         "print([m for m in ('tensorboard', 'wandb', 'google') if m in sys.modules])"
@@ -37,14 +36,13 @@ def test_import_loads_no_service():
         ("wandb", "WandbTracker(mode='offline')"),
     ],
 )
-def test_missing_package_is_named_with_the_way_out(package, call, tmp_path):
-    """By the constructor, before anything is written."""
+def test_missing_package_names_the_extra(package, call, tmp_path):
     code = f"import sys\nsys.modules[{package!r}] = None\n"
     code += f"import mjrec.trackers as t\nt.{call}"
-    said = run_python(code, cwd=tmp_path, status=1).stderr
-    assert "mjrec.errors.MissingDependency" in said
-    assert f"{package}, which is not installed. Run: pip install" in said
-    assert f'"mjrec[{package}]"' in said
+    error = run_python(code, cwd=tmp_path, status=1).stderr
+    assert "mjrec.errors.MissingDependency" in error
+    assert f"{package}, which is not installed. Run: pip install" in error
+    assert f'"mjrec[{package}]"' in error
     assert list(tmp_path.iterdir()) == []
 
 
@@ -54,7 +52,7 @@ def run(tmp_path):
 
 
 def test_header_and_rows(run):
-    """Times count from the header's; rewards are as exact as they were."""
+    """Times count from the header's; rewards are exact."""
     before = time.time()
     tracker = MonitorCsvTracker()
     tracker.begin(run)
@@ -77,18 +75,18 @@ def test_header_and_rows(run):
     assert float(cells[2][2]) == pytest.approx(before + 100 - start["t_start"])
 
 
-def test_each_run_has_a_file_of_its_own(run, tmp_path, monkeypatch):
-    """Sub-environments in one directory, wherever the script has gone meanwhile."""
+def test_each_run_has_its_own_file(run, tmp_path, monkeypatch):
+    """A relative path is resolved at construction."""
     (tmp_path / "logs").mkdir()
     monkeypatch.chdir(tmp_path)
     tracker = MonitorCsvTracker("logs")
     monkeypatch.chdir(tmp_path / "logs")
     runs = [dataclasses.replace(run, env_index=i, infix=f"{i}.4711") for i in range(2)]
-    for one in runs:
-        tracker.begin(one)
-    for number, one in enumerate(reversed(runs)):
-        tracker.episode(one, episode(number))
-        tracker.end(one)
+    for each in runs:
+        tracker.begin(each)
+    for number, each in enumerate(reversed(runs)):
+        tracker.episode(each, episode(number))
+        tracker.end(each)
     texts = [path.read_text() for path in sorted((tmp_path / "logs").iterdir())]
     assert [text.splitlines()[2].split(",")[0] for text in texts] == ["1.5", "0.0"]
 
@@ -100,8 +98,8 @@ def test_each_run_has_a_file_of_its_own(run, tmp_path, monkeypatch):
         ("logs/monitor.csv", {"1.monitor.csv", "2.monitor.csv", "monitor.csv"}),
     ],
 )
-def test_file_that_is_there_is_never_written_to(run, path, made, tmp_path):
-    """The next free name is taken, one that Stable-Baselines3 finds too."""
+def test_existing_files_are_never_written_to(run, path, made, tmp_path):
+    """The tracker takes the next free name that Stable-Baselines3 finds."""
     first = tmp_path / "logs" / max(made)
     first.parent.mkdir()
     first.write_text("precious")
@@ -115,7 +113,7 @@ def test_file_that_is_there_is_never_written_to(run, path, made, tmp_path):
         MonitorCsvTracker(first / "a").begin(run)
 
 
-def test_full_disk_is_named_and_tears_no_row(run):
+def test_full_disk_is_an_error_and_tears_no_row(run):
     """Half a row would be read as another one."""
     tracker = MonitorCsvTracker()
     tracker.begin(run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Event files, read back by TensorBoard's own reader."""
+"""TensorBoard event files, read back by TensorBoard's own reader."""
 
 import dataclasses
 import io
@@ -19,7 +19,7 @@ from mjrec.trackers.tensorboard import animated_gif
 
 @pytest.fixture
 def finished(tmp_path, make_corridor, play):
-    """A video of eleven frames at ten a second."""
+    """A video of eleven frames at ten frames a second."""
     return record(tmp_path / "recordings", make_corridor(10), play)
 
 
@@ -29,8 +29,8 @@ def read(directory):
     return events
 
 
-def test_scalars_stand_over_the_steps_of_the_run(finished):
-    """Success only where it is known, evaluation apart, NaN as it is."""
+def test_scalars_are_logged_at_the_steps_of_the_run(finished):
+    """Success only where it is known; evaluation has its own tags."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode(0, success=True))
@@ -47,14 +47,14 @@ def test_scalars_stand_over_the_steps_of_the_run(finished):
     assert [(e.step, e.value) for e in events.Scalars("evaluation/return")] == [(30, 3)]
 
 
-def test_video_is_played_as_a_gif_of_the_file(finished):
-    """It shows the whole episode, moves on, and stands at its episode's step."""
+def test_video_is_logged_as_an_animated_gif(finished):
+    """It has all frames, at the last step of its episode."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode(0))
     tracker.episode(run, episode(5))
     tracker.video(run, finished.video)
-    # One that was cut off, for instance, stands at the last step.
+    # A video without an episode is logged at the latest step.
     tracker.video(run, dataclasses.replace(finished.video, episode=None, view="side"))
     tracker.end(run)
     events = read(run.directory / "tensorboard" / "0.4711")
@@ -70,10 +70,10 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
         # The bar grows by four pixels a step.
         for step in (0, 5, 10):
             opened.seek(step)
-            shown = opened.convert("RGB")
-            assert shown.getpixel((4 * step + 1, 16))[0] > 150
-            assert shown.getpixel((min(4 * step + 7, 47), 16))[0] < 60
-    # A long one lasts as long, with fewer frames.
+            frame = opened.convert("RGB")
+            assert frame.getpixel((4 * step + 1, 16))[0] > 150
+            assert frame.getpixel((min(4 * step + 7, 47), 16))[0] < 60
+    # A long video keeps its duration with fewer frames.
     long = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
     with Image.open(io.BytesIO(long)) as opened:
         assert opened.n_frames <= 100
@@ -82,8 +82,7 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
     assert text.step == 10
 
 
-def test_runs_are_told_apart(finished, tmp_path):
-    """Sub-environments, and two directories with one infix, in one `log_dir`."""
+def test_runs_have_their_own_names(finished, tmp_path):
     changes = [
         {"env_index": 0},
         {"env_index": 1, "infix": "1.4711"},
@@ -110,12 +109,12 @@ def test_runs_are_told_apart(finished, tmp_path):
 
 
 def test_damaged_files_are_named(finished, tmp_path):
-    """Ffmpeg's error comes home at the end at the latest; events before it stay."""
+    """Errors of ffmpeg are raised by `end` at the latest; earlier events stay."""
     finished.video.path.write_bytes(b"no video")
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode())
-    # Events are there at once: a killed process loses none.
+    # Events are flushed at once, so a killed process loses none.
     assert read(run.directory / "tensorboard" / "0.4711").Scalars("training/return")
     tracker.video(run, finished.video)
     finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))

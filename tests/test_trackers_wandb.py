@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights & Biases, offline: its files are read back."""
+"""Weights & Biases, offline; its files are read back."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from mjrec.trackers import WandbTracker
 
 @pytest.fixture(autouse=True)
 def quiet(monkeypatch):
-    """Nothing of a user's account or console is touched, and no run is left."""
+    """Touch no account or console, and end every run."""
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("WANDB_CONSOLE", "off")
     yield
@@ -28,13 +28,11 @@ def finished(tmp_path, make_corridor, play):
 
 
 def offline(directory):
-    """Return the arguments of an offline run in `directory`."""
     return {"project": "p", "mode": "offline", "dir": str(directory)}
 
 
 def log_of(directory):
-    # A run that is finished may still be on its way to the disk.
-    wandb.teardown()
+    wandb.teardown()  # flushes finished runs
     [path] = directory.glob("wandb/offline-run-*/*.wandb")
     return path
 
@@ -44,16 +42,16 @@ def logged(directory, key):
 
 
 def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
-    """Success only where it is known, evaluation and sub-environments apart."""
+    """Evaluation and sub-environments have keys of their own."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     second = dataclasses.replace(run, infix="1.4711", env_index=3)
-    for one in (run, second):
-        tracker.begin(one)
+    for each in (run, second):
+        tracker.begin(each)
     tracker.episode(run, episode(0, success=True))
     tracker.episode(run, episode(1))
     tracker.episode(run, episode(2, type="e"))
     tracker.end(run)
-    # Its own run ends with the last monitor.
+    # The tracker's run ends with its last monitor.
     tracker.episode(second, episode(3))
     tracker.end(second)
     assert wandb.run is None
@@ -68,8 +66,8 @@ def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
     assert over["training/env3/*"] == "training/env3/total_steps"
 
 
-def test_video_is_the_file_itself_and_may_come_late(finished, tmp_path):
-    """Byte for byte, at its own episode's step, after later episodes."""
+def test_late_video_is_logged_at_its_own_step(finished, tmp_path):
+    """The file is copied byte for byte."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     tracker.begin(run)
     for number in range(3):
@@ -90,8 +88,8 @@ def test_video_is_the_file_itself_and_may_come_late(finished, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["given", "active", "beside"])
-def test_a_run_of_others_stays_open(how, finished, tmp_path):
-    """One that is given, or is active; asked for another, it makes and ends that."""
+def test_foreign_run_stays_open(how, finished, tmp_path):
+    """With options, the tracker makes and ends a run of its own."""
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()
     theirs = wandb.init(**offline(tmp_path / "theirs"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What trackers are told."""
+"""Events that trackers receive."""
 
 import gymnasium
 import numpy as np
@@ -9,11 +9,11 @@ import mjrec
 from mjrec.recorder.tracking import Tracker
 
 
-class Listening(Tracker):
-    """Writes down all that it is told, and fails where it is told to."""
+class RecordingTracker(Tracker):
+    """Records all events, and raises at those in `fails`."""
 
     def __init__(self, fails=()):
-        self.told, self.fails = [], fails
+        self.events, self.fails = [], fails
 
     def begin(self, run):
         self.note("begin", run)
@@ -29,21 +29,21 @@ class Listening(Tracker):
     def end(self, run):
         self.note("end", run)
 
-    def note(self, what, run, facts=None):
-        self.told.append((what, run, facts))
-        if what in self.fails:
+    def note(self, kind, run, facts=None):
+        self.events.append((kind, run, facts))
+        if kind in self.fails:
             raise ConnectionError("no server")
 
-    def of(self, what):
-        return [facts for told, _, facts in self.told if told == what]
+    def of(self, kind):
+        return [facts for each, _, facts in self.events if each == kind]
 
 
 def record(directory, *trackers, **options):
-    """Record two episodes of three steps; return the monitor, closed."""
+    """Record two episodes of three steps; return the closed monitor."""
     view = {"height": 32, "width": 32, "render_mode": "rgb_array"}
-    made = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3, **view)
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3, **view)
     options = {"trackers": trackers, **options}
-    with mjrec.Monitor(made, directory, lambda _: True, **options) as env:
+    with mjrec.Monitor(env, directory, lambda _: True, **options) as env:
         for seed in range(2):
             env.reset(seed=seed)
             for _ in range(3):
@@ -51,11 +51,10 @@ def record(directory, *trackers, **options):
     return env
 
 
-def test_tracker_is_told_every_episode_and_live_video(tmp_path):
-    """In order, with the facts of each, and of which run."""
-    tracker = Listening()
+def test_tracker_receives_episodes_and_live_videos_in_order(tmp_path):
+    tracker = RecordingTracker()
     env = record(tmp_path, tracker, render="live")
-    assert [what for what, *_ in tracker.told] == [
+    assert [kind for kind, *_ in tracker.events] == [
         *("begin", "episode", "video", "episode", "video", "end")
     ]
     first, second = tracker.of("episode")
@@ -63,31 +62,30 @@ def test_tracker_is_told_every_episode_and_live_video(tmp_path):
     assert (first.truncated, first.seed, second.seed) == (True, 0, 1)
     assert (first.total_steps, second.total_steps) == (3, 6)
     assert [video.episode for video in tracker.of("video")] == [first, second]
-    assert {(run.infix, run.directory, run.env_id) for _, run, _ in tracker.told} == {
-        (env.infix, tmp_path, "InvertedPendulum-v5")
-    }
+    runs = {(run.infix, run.directory, run.env_id) for _, run, _ in tracker.events}
+    assert runs == {(env.infix, tmp_path, "InvertedPendulum-v5")}
 
 
-def test_tracker_is_told_deferred_videos_when_they_are_there(tmp_path):
-    """At the latest in close; each once, whole; of pending ones never."""
-    tracker, pending = Listening(), Listening()
+def test_tracker_receives_each_deferred_video_once_finished(tmp_path):
+    """It never receives pending videos."""
+    tracker, pending = RecordingTracker(), RecordingTracker()
     record(tmp_path, tracker)
     videos = tracker.of("video")
     assert [video.episode_id for video in videos] == [0, 1]
     assert [len(frames_of(video.path)) for video in videos] == [4, 4]
-    assert tracker.told[-1][0] == "end"
+    assert tracker.events[-1][0] == "end"
     record(tmp_path / "pending", pending, workers=0)
     assert len(pending.of("episode")) == 2
     assert not pending.of("video")
 
 
-def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(tmp_path, caplog):
-    """The log has why, the manifest too, and the others are told all."""
-    failing, listening = Listening(("episode", "end")), Listening()
-    record(tmp_path, failing, listening, render="live")
-    assert [what for what, *_ in failing.told] == ["begin", "episode", "end"]
-    assert len(listening.of("episode")) == 2
-    assert "Listening failed" in caplog.text
+def test_failing_tracker_is_dropped_and_others_continue(tmp_path, caplog):
+    """The log and the manifest have the reason."""
+    failing, other = RecordingTracker(("episode", "end")), RecordingTracker()
+    record(tmp_path, failing, other, render="live")
+    assert [kind for kind, *_ in failing.events] == ["begin", "episode", "end"]
+    assert len(other.of("episode")) == 2
+    assert "RecordingTracker failed" in caplog.text
     [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
-    reason = "Listening: no server"
+    reason = "RecordingTracker: no server"
     assert fault == {"episode_id": 0, "what": "tracker", "reason": reason}

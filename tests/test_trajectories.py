@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes are read back as arrays, with the model of each step."""
+"""Recorded episodes as arrays, with the model of each step."""
 
 import gymnasium
 import mujoco
@@ -14,43 +14,41 @@ from mjrec.formats.trajectory_file import finish_trajectory
 
 
 def record(directory, change=lambda step, model: None, **options):
-    """Record twelve steps; return the recording in flight, and what was seen of it."""
+    """Record twelve steps; return the recording in flight, and its arrays."""
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=12)
     options = {"workers": 0, "observations": True, **options}
     monitor = mjrec.Monitor(env, directory, **options)
     model, data = env.unwrapped.model, env.unwrapped.data
     change(0, model)
-    # A reset that another one replaces leaves nothing.
-    monitor.reset(seed=3)
-    seen = {"observations": [monitor.reset(seed=7)[0]], "qpos": [data.qpos.copy()]}
-    seen |= {"actions": [], "rewards": []}
+    monitor.reset(seed=3)  # replaced by the next reset
+    arrays = {"observations": [monitor.reset(seed=7)[0]], "qpos": [data.qpos.copy()]}
+    arrays |= {"actions": [], "rewards": []}
     for step in range(1, 13):
         change(step, model)
         action = np.cos(np.arange(step, step + 6))
         observation, reward, *_ = monitor.step(action)
         values = (observation, data.qpos.copy(), action, reward)
-        for name, value in zip(seen, values, strict=True):
-            seen[name].append(value)
+        for name, value in zip(arrays, values, strict=True):
+            arrays[name].append(value)
     monitor.close(wait=False)
     [path] = in_flight(directory)
-    return path, seen
+    return path, arrays
 
 
 def in_both_forms(path):
-    """Load what is in flight, and then the finished file."""
+    """Load the recording in flight, then the finished file."""
     yield mjrec.load_trajectory(str(path))
     yield mjrec.load_trajectory(finish_trajectory(path))
 
 
-def test_everything_is_there_as_arrays(tmp_path):
-    """With the documented shapes; an unknown component is an error that lists them."""
-    path, seen = record(tmp_path, max_fps=10)
-    qpos = seen.pop("qpos")
+def test_trajectory_has_all_arrays_in_documented_shapes(tmp_path):
+    path, arrays = record(tmp_path, max_fps=10)
+    qpos = arrays.pop("qpos")
     for trajectory in in_both_forms(path):
         assert isinstance(trajectory, mjrec.Trajectory)
         assert trajectory.path == path
         assert len(trajectory) == 12
-        for name, values in seen.items():
+        for name, values in arrays.items():
             np.testing.assert_array_equal(getattr(trajectory, name), values)
         assert trajectory.truncated.tolist() == [False] * 11 + [True]
         assert not trajectory.terminated.any()
@@ -58,7 +56,9 @@ def test_everything_is_there_as_arrays(tmp_path):
         assert trajectory.snapshots["geom_xpos"].shape == (7, 9, 3)
         np.testing.assert_array_equal(trajectory.component("qpos"), qpos)
         assert trajectory.component("warmstart").shape == (13, 9)
-        np.testing.assert_array_equal(trajectory.component("ctrl")[1:], seen["actions"])
+        np.testing.assert_array_equal(
+            trajectory.component("ctrl")[1:], arrays["actions"]
+        )
         np.testing.assert_allclose(trajectory.time, np.arange(13) * 0.05)
         assert {"time", "qpos", "qvel", "ctrl"} <= set(trajectory.components)
         with pytest.raises(UnknownName, match=r"no state component 'qqpos'.*qpos"):
@@ -71,9 +71,7 @@ def test_everything_is_there_as_arrays(tmp_path):
         assert "HalfCheetah-v5, 12 steps" in repr(trajectory)
 
 
-def test_the_model_is_that_of_the_step(tmp_path):
-    """Changes hold from their steps on; an unknown step is an error."""
-
+def test_model_includes_changes_up_to_the_step(tmp_path):
     def change(step, model):
         if step == 0:
             model.opt.gravity[2] = -1.5
@@ -95,8 +93,9 @@ def test_the_model_is_that_of_the_step(tmp_path):
                 use(step)
 
 
-def test_a_recording_without_a_simulation_has_no_model(tmp_path, corridor, play):
-    """Its rewards are there all the same; a directory is answered with its names."""
+def test_recording_without_a_simulation_has_rewards_but_no_model(
+    tmp_path, corridor, play
+):
     with pytest.raises(InvalidArgument, match="without trajectories"):
         mjrec.load_trajectory(tmp_path)
     with mjrec.Monitor(corridor, tmp_path, False, trajectory_callable=True) as env:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished trajectories, alone or in a bundle, hold what their log held."""
+"""Finished trajectories, alone or bundled, hold the content of their log."""
 
 import json
 import math
@@ -53,12 +53,11 @@ CHANGES = (
 
 @pytest.fixture
 def path(tmp_path):
-    """The file of the episode, which is not there yet."""
     return tmp_path / f"{NAME}.h5"
 
 
 def names(directory):
-    """Return the names of the files there but the journal and what is in flight."""
+    """Return the names of finished files."""
     files = [path.name for path in directory.iterdir() if path.suffix != ".jsonl"]
     return [name for name in files if ".states." not in name]
 
@@ -92,17 +91,17 @@ def check_changes(content):
 @pytest.mark.parametrize(
     ("steps", "every", "dtype"),
     [
-        *((40, 2, DTYPE), (0, 1, DTYPE)),
-        # More than fits into one chunk of any dataset.
-        (700, 1, DTYPE),
+        (40, 2, DTYPE),
+        (0, 1, DTYPE),
+        (700, 1, DTYPE),  # several chunks in each dataset
         (3, 2, row_dtype()),
         (3, 2, row_dtype(state=STATE, action=np.dtype("<i8"))),
         (3, 2, row_dtype(action=np.dtype(("<f8", (0,))))),
         (3, 2, row_dtype(snapshot=SNAPSHOT)),
     ],
 )
-def test_the_finished_file_holds_what_the_log_held(path, steps, every, dtype):
-    """Bit for bit, NaNs with their payloads; what is not recorded is not there."""
+def test_finished_file_equals_its_log(path, steps, every, dtype):
+    """NaN payloads are kept, and unrecorded arrays are absent."""
     facts = {**FACTS, "long": "x" * 10**5}
     record(path, steps, every=every, dtype=dtype, facts=facts)
     assert finish_trajectory(path) == path
@@ -115,8 +114,7 @@ def test_the_finished_file_holds_what_the_log_held(path, steps, every, dtype):
         check_changes(content)
 
 
-def test_an_episode_that_was_killed_says_so(path):
-    """Also before its first row; its rewards are added up one after the other."""
+def test_killed_episode_records_its_reason(path):
     for steps in (-1, 12):
         record(path, steps, ended=False)
         content = read(finish_trajectory(path))
@@ -125,17 +123,17 @@ def test_an_episode_that_was_killed_says_so(path):
         assert content.facts == {**FACTS, "complete": False, **facts}
         assert len(content.states) == steps + 1
         path.unlink()
-    # As a monitor does at each step, on every version of Python.
+    # As the monitor adds at each step; Python 3.12's `sum` differs.
     assert added_up([1e16, 1.0, -1e16]) == 0.0
     assert math.copysign(1, added_up([-0.0])) == 1
 
 
-def test_plain_h5py_finds_every_array_by_its_name(path):
-    """With the format of HDF5 1.10, and no filter that is not built in."""
+def test_h5py_reads_every_array_by_name(path):
+    """The file has HDF5 1.10's format and only built-in filters."""
     record(path)
     content = read(path)
     finish_trajectory(path)
-    # HDF5 refuses a file that is open in one process in two different ways.
+    # HDF5 refuses to open one file in two different ways in one process.
     with open_trajectory(path), h5py.File(path) as file, open_trajectory(path):
         assert set(file) == {
             *("states", "actions", "rewards", "terminated", "truncated"),
@@ -154,29 +152,27 @@ def test_plain_h5py_finds_every_array_by_its_name(path):
             count = properties.get_nfilters()
             filters = [properties.get_filter(i)[0] for i in range(count)]
             assert filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
-    # The superblock's version: 3 is that of 1.10.
-    assert path.read_bytes()[8] == 3
+    assert path.read_bytes()[8] == 3  # superblock of HDF5 1.10
 
 
-def test_the_example_of_the_specification_runs(path, monkeypatch, capsys):
-    """What docs/reference/trajectories.md shows a stranger works on a real file."""
+def test_examples_of_the_trajectory_reference_run(path, monkeypatch, capsys):
     record(path)
     finish_trajectory(path).rename(path.with_name("episode.h5"))
     docs = Path(__file__).parents[1] / "docs"
     text = (docs / "reference" / "trajectories.md").read_text()
-    of_one, of_several = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    single, bundled = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(path.parent)
-    exec(compile(of_one, "trajectories.md", "exec"), {})
+    exec(compile(single, "trajectories.md", "exec"), {})
     assert "E-v0" in capsys.readouterr().out
     record(path)
     bundle_trajectories([path])
     bundle_of(path).rename(path.with_name("episodes.h5"))
-    exec(compile(of_several, "trajectories.md", "exec"), {})
+    exec(compile(bundled, "trajectories.md", "exec"), {})
     assert capsys.readouterr().out == "episode000027 7 (41, 2)\n"
 
 
-def test_what_is_finished_meanwhile_is_read(path, monkeypatch):
-    """Who finds it in flight gets what it has become; an open reader keeps its log."""
+def test_recording_finished_during_opening_is_read(path, monkeypatch):
+    """An open reader keeps its log."""
     real = trajectory_file.open_recording
 
     def open_late(name):
@@ -196,19 +192,18 @@ def test_what_is_finished_meanwhile_is_read(path, monkeypatch):
         path.unlink()
 
 
-def test_a_full_disk_leaves_the_log_and_nothing_else(path):
-    """One error that names the file; with room again it succeeds."""
+def test_full_disk_leaves_only_the_log(path):
     record(path)
     for room in (0, 700, 5000):
-        said = pytest.raises(FileNotWritten, match=r"\.h5: File too large")
-        with file_size_limit(room), said:
+        error = pytest.raises(FileNotWritten, match=r"\.h5: File too large")
+        with file_size_limit(room), error:
             finish_trajectory(path)
         assert names(path.parent) == []
     finish_trajectory(path)
 
 
-def test_without_a_log_that_can_be_read_there_is_one_clear_error(path):
-    """Neither log nor file; or a damaged journal, without which the log stays."""
+def test_missing_or_damaged_log_is_an_error(path):
+    """A damaged journal hides the log, which stays."""
     with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor its log"):
         finish_trajectory(path)
     record(path)
@@ -219,12 +214,11 @@ def test_without_a_log_that_can_be_read_there_is_one_clear_error(path):
     assert log.exists()
 
 
-# 24 MB of frames that cannot be compressed.
+# 600 rows take 24 MB that cannot be compressed.
 LONG = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (5000,)))]))
 
 
 def test_memory_does_not_grow_with_the_episode(path):
-    """What was written is in the file, and not in memory as well."""
     record(path, 600, dtype=LONG)
     tracemalloc.start()
     try:
@@ -235,8 +229,8 @@ def test_memory_does_not_grow_with_the_episode(path):
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_leaves_the_log_and_nothing_else(path, monkeypatch):
-    """Also between HDF5 and its file, where an exception would crash it."""
+def test_ctrl_c_leaves_only_the_log(path, monkeypatch):
+    """An exception inside a callback of HDF5 would crash."""
     record(path, 600, dtype=LONG)
     usual = trajectory_hdf5._Unfailing.write
 
@@ -252,62 +246,8 @@ def test_ctrl_c_leaves_the_log_and_nothing_else(path, monkeypatch):
     finish_trajectory(path)
 
 
-def replaced(name, *data, **options):
-    """Return what puts another dataset in the place of one."""
-
-    def replace(file):
-        del file[name]
-        file.create_dataset(name, *data, **options)
-
-    return replace
-
-
-def linked(file):
-    del file["rewards"]
-    file["rewards"] = h5py.ExternalLink("other.h5", "/x")
-
-
-HARM = {
-    "not a trajectory": lambda file: file.attrs.update(format=np.bytes_(b"robomimic")),
-    "has the wrong type": lambda file: file.attrs.update(format="mjrec trajectory"),
-    "update mjrec": lambda file: file.attrs.update(format_version=np.int64(2)),
-    "its facts are damaged": lambda file: file.attrs.update(facts=np.bytes_(b"{}")),
-    "the same number of steps": replaced("actions", data=np.zeros((3, 3), "f4")),
-    "components that are not float64": replaced("states", data=np.zeros(41, "f4,f4")),
-    "not a valid dtype": replaced("rewards", data=["a"] * 40),
-    "rewards have": replaced("rewards", data=np.zeros((40, 2))),
-    "the snapshot of a row": replaced("snapshots", data=np.zeros(41)),
-    "frame steps are out of order": replaced("frame_steps", data=np.arange(41)[::-1]),
-    "a way that mjrec does not write": replaced(
-        "rewards", (40,), "<f8", external=[("/etc/passwd", 0, 320)]
-    ),
-    "rewards is stored in a way": replaced(
-        "rewards", data=np.ones(40), chunks=(40,), compression="lzf"
-    ),
-    "no 'rewards' of its": linked,
-    "is not a group": replaced("model_changes", data=np.zeros(3)),
-    "no 'truncated' of its own": lambda file: file.__delitem__("truncated"),
-    "no '0' of its": lambda file: file.move("model_changes/0", "model_changes/9"),
-}
-
-
-@pytest.mark.parametrize("reason", HARM)
-def test_a_file_of_another_making_is_refused(path, reason):
-    """One clear error for each thing that is not as mjrec writes it."""
-    record(path)
-    finish_trajectory(path)
-    with h5py.File(path, "r+") as file:
-        HARM[reason](file)
-    with pytest.raises(UnreadableFile, match=reason) as error:
-        read(path)
-    assert error.value.path == path
-
-
-# --- many in one file -----------------------------------------------------------------
-
-
 def record_several(directory, *episodes):
-    """Record episodes of as many steps as their number says, the last one killed."""
+    """Record episodes with as many steps as their number; the last has no end."""
     directory.mkdir(exist_ok=True)
     logs = new_logs(directory, INFIX)
     for episode in episodes:
@@ -318,21 +258,20 @@ def record_several(directory, *episodes):
     return [logs.path_of(trajectory_prefix(INFIX, episode)) for episode in episodes]
 
 
-def test_a_bundle_holds_what_files_would_hold(tmp_path):
-    """Dataset by dataset; strangers read it with h5py."""
+def test_bundle_equals_single_files(tmp_path):
     numbers = (3, 4, 5, 9, 12)
-    apart, together = (record_several(tmp_path / name, *numbers) for name in "ab")
-    assert bundle_trajectories(together) == {}
-    bundle = bundle_of(together[0])
+    singles, bundled_ones = (record_several(tmp_path / name, *numbers) for name in "ab")
+    assert bundle_trajectories(bundled_ones) == {}
+    bundle = bundle_of(bundled_ones[0])
     assert not list(bundle.parent.glob("openaigym.states.*"))
-    for number, single, bundled in zip(numbers, apart, together, strict=True):
+    for number, single, bundled in zip(numbers, singles, bundled_ones, strict=True):
         finish_trajectory(single)
         assert is_finished(bundled)
         assert file_of(bundled) == bundle
         assert datasets_in(bundled) == datasets_in(single)
         assert read(bundled).facts == read(single).facts
         check(read(bundled), number)
-    assert read(together[-1]).facts["reason"] == "killed"
+    assert read(bundled_ones[-1]).facts["reason"] == "killed"
     with h5py.File(bundle) as file:
         assert sorted(file) == [f"episode{number:06d}" for number in numbers]
         assert file["episode000009/states"]["qpos"].shape == (10, 2)
@@ -340,8 +279,8 @@ def test_a_bundle_holds_what_files_would_hold(tmp_path):
         assert json.loads(raw.readline())["episodes"] == [[3, 5], [9, 9], [12, 12]]
 
 
-def test_more_come_into_a_bundle_and_facts_change(tmp_path):
-    """What was there is as before, bit for bit; on a full disk the log stays."""
+def test_bundle_takes_more_episodes_and_new_facts(tmp_path):
+    """Earlier episodes stay bit for bit; on a full disk the log stays."""
     paths = record_several(tmp_path, 20, 300, 301)
     assert bundle_trajectories(paths[:1]) == {}
     bundle = bundle_of(paths[0])
@@ -361,8 +300,8 @@ def test_more_come_into_a_bundle_and_facts_change(tmp_path):
         check(read(path), number)
 
 
-def test_a_directory_lists_what_lies_in_bundles(tmp_path):
-    """Beside files of their own; a bundle itself is none, and says what it holds."""
+def test_directory_lists_bundled_trajectories(tmp_path):
+    """A bundle itself is not a trajectory; its error names one that is."""
     own, *others = record_several(tmp_path, 1, 2, 3)
     finish_trajectory(own)
     bundle_trajectories([own, *others])
@@ -380,7 +319,7 @@ def test_a_directory_lists_what_lies_in_bundles(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "episodes"),
+    ("kind", "episodes"),
     [
         ("mjrec trajectories", "[[0, 9999999]]"),
         ("mjrec trajectories", "[[5, 4]]"),
@@ -391,11 +330,10 @@ def test_a_directory_lists_what_lies_in_bundles(tmp_path):
         (None, ""),
     ],
 )
-def test_an_index_that_lies_names_no_episode(tmp_path, said, episodes):
-    """One without episodes takes no memory, and no group leads elsewhere."""
+def test_invalid_bundle_index_names_no_episode(tmp_path, kind, episodes):
     [path] = record_several(tmp_path, 1)
-    index = f'{{"format": "{said}", "version": 1, "episodes": {episodes}}}'
-    bundle_of(path).write_bytes((index if said else episodes).encode("latin-1") + b"\n")
+    index = f'{{"format": "{kind}", "version": 1, "episodes": {episodes}}}'
+    bundle_of(path).write_bytes((index if kind else episodes).encode("latin-1") + b"\n")
     assert not is_finished(path)
     assert trajectories_in(bundle_of(path)) == []
     check(read(path), 1)
@@ -409,10 +347,8 @@ def test_an_index_that_lies_names_no_episode(tmp_path, said, episodes):
 
 
 @pytest.mark.parametrize("is_written", [False, True])
-def test_what_a_killed_monitor_left_comes_into_its_bundle(
-    tmp_path, monkeypatch, is_written
-):
-    """Also where it was killed after the bundle was there, before its logs were."""
+def test_recovery_bundles_a_killed_run(tmp_path, monkeypatch, is_written):
+    """The kill may fall between writing the bundle and removing the logs."""
     paths = record_several(tmp_path, 4, 5)
     if is_written:
         with monkeypatch.context() as patched:
@@ -422,8 +358,8 @@ def test_what_a_killed_monitor_left_comes_into_its_bundle(
     assert any("states" in path.name for path in tmp_path.iterdir())
     recovery = mjrec.recover(tmp_path, bundle=True)
     assert not recovery.failures
-    said = [file.what for file in recovery.files if "trajectory" in file.name]
-    assert said == ([] if is_written else ["4 steps", "5 steps, incomplete: killed"])
+    made = [file.what for file in recovery.files if "trajectory" in file.name]
+    assert made == ([] if is_written else ["4 steps", "5 steps, incomplete: killed"])
     assert not any("states" in path.name for path in tmp_path.iterdir())
     assert not any(path.is_file() for path in paths)
     assert [len(mjrec.load_trajectory(path)) for path in paths] == [4, 5]

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Monitors of vector environments."""
+
 import contextlib
 import functools
 import gc
@@ -41,52 +43,48 @@ pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 @pytest.fixture
 def corridors(make_corridor):
-    """Make corridors, 2 and 3 steps long if not said, in a list or in one object."""
-
-    def make(mode=NEXT_STEP, *, where="here", lengths=LENGTHS, size=(32, 48)):
-        if where == "one object":
+    def make(mode=NEXT_STEP, *, kind="sync", lengths=LENGTHS, size=(32, 48)):
+        if kind == "one object":
             return VectorCorridor(lengths, mode)
-        each = [functools.partial(make_corridor, n, size=size) for n in lengths]
-        kind = {"here": SyncVectorEnv, "other processes": AsyncVectorEnv}[where]
-        return kind(each, autoreset_mode=mode)
+        constructors = [functools.partial(make_corridor, n, size=size) for n in lengths]
+        vector = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}[kind]
+        return vector(constructors, autoreset_mode=mode)
 
     return make
 
 
 def pendulums(count):
-    """Return small pendulums whose episodes have two steps."""
+    """Make small pendulums with episodes of two steps."""
     make = functools.partial(
         gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
     )
     return SyncVectorEnv([make] * count)
 
 
-@pytest.mark.parametrize("where", ["here", "one object", "other processes"])
+@pytest.mark.parametrize("kind", ["sync", "one object", "async"])
 @pytest.mark.parametrize("mode", MODES)
-def test_every_sub_environment_has_whole_videos(
-    corridors, tmp_path, caplog, where, mode
-):
+def test_each_sub_environment_has_whole_videos(corridors, tmp_path, caplog, kind, mode):
     """Where a reset hides the terminal frame, metadata and one warning say so."""
-    is_hidden = where != "here" and mode == SAME_STEP
-    with mjrec.Monitor(corridors(mode, where=where), tmp_path) as env:
+    is_hidden = kind != "sync" and mode == SAME_STEP
+    with mjrec.Monitor(corridors(mode, kind=kind), tmp_path) as env:
         play(env, 8, seed=8)
     for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
         for episode in (0, 1):
             path = path_of(monitor, episode, "mp4")
             frames = list(range(length + (not is_hidden)))
-            assert shown(path, step=16 if where == "one object" else 4) == frames
-            said = metadata_at(path.with_suffix(".meta.json"))
-            assert said.get("final_frame") == ("missing" if is_hidden else None)
+            assert shown(path, step=16 if kind == "one object" else 4) == frames
+            metadata = metadata_at(path.with_suffix(".meta.json"))
+            assert metadata.get("final_frame") == ("missing" if is_hidden else None)
             if episode == 0:
-                assert said["seed"] == (8 if where == "one object" else 8 + index)
+                assert metadata["seed"] == (8 if kind == "one object" else 8 + index)
     messages = [r.message for r in caplog.records if "last frame" in r.message]
-    of_all = ["functions that create them" in each for each in messages]
-    assert of_all == [True] * is_hidden
+    advice = ["functions that create them" in each for each in messages]
+    assert advice == [True] * is_hidden
 
 
 # Takes more than five seconds: 64 videos.
 def test_sixty_four_sub_environments(tmp_path):
-    """Each has its trajectory and its video; their logs' tails have 4 MiB together."""
+    """Each has its trajectory and video; their log tails share 4 MiB."""
     with mjrec.Monitor(pendulums(64), tmp_path, workers=2, quality="draft") as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
@@ -102,7 +100,7 @@ def test_sixty_four_sub_environments(tmp_path):
 
 
 def test_each_monitor_reports_its_own_failures(tmp_path):
-    """Although the sub-environments share the processes that render."""
+    """The sub-environments share the rendering processes."""
     env = mjrec.Monitor(pendulums(2), tmp_path, workers=1, quality="draft")
     good, bad = env.monitors
     path_of(bad, 0, "mp4").mkdir()
@@ -117,7 +115,7 @@ def test_each_monitor_reports_its_own_failures(tmp_path):
         env.close()
 
 
-def test_closing_puts_the_environments_back(corridors, tmp_path):
+def test_close_restores_the_sub_environments(corridors, tmp_path):
     """Each is closed once; until then calls reach them through their monitors."""
     vector = corridors()
     originals = list(vector.envs)
@@ -136,17 +134,16 @@ def test_closing_puts_the_environments_back(corridors, tmp_path):
         assert [each.closed for each in originals] == [1, 1]
         env.reset()
         env.step(np.array([0, 0]))
-    # Rewards are those below vector wrappers; after close nothing is recorded.
+    # Monitors record rewards below vector wrappers, and nothing after close.
     assert env.get_episode_rewards() == [[1.0], []]
     assert [m.stats_recorder.episode_types for m in env.monitors] == [["e"], []]
-    # Links of two sub-environments have different names.
     prefixes = [monitor._options.name_prefix for monitor in env.monitors]
     assert prefixes == ["walk-env-0", "walk-env-1"]
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_a_failing_constructor_leaves_no_trace(make_corridor, tmp_path, names, resume):
-    """The last sub-environment cannot be drawn: nothing was made of the first."""
+def test_failing_constructor_leaves_no_files(make_corridor, tmp_path, names, resume):
+    """The last sub-environment has no frames."""
     target = tmp_path / "a" / "b"
     if resume:
         mjrec.Monitor(make_corridor(), target).close()
@@ -160,10 +157,10 @@ def test_a_failing_constructor_leaves_no_trace(make_corridor, tmp_path, names, r
     assert names(target if resume else tmp_path) == before
 
 
-@pytest.mark.parametrize("where", ["here", "one object"])
-def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, where):
-    """Their videos say what has ended them; nothing can be pickled or misused."""
-    vector = corridors(where=where)
+@pytest.mark.parametrize("kind", ["sync", "one object"])
+def test_error_is_noted_in_all_running_episodes(corridors, tmp_path, kind):
+    """Steps before reset and pickling are errors as well."""
+    vector = corridors(kind=kind)
 
     def explode(action):
         raise RuntimeError("the motor burns")
@@ -174,17 +171,16 @@ def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, where):
     with pytest.raises(ResetNeeded):
         env.step(np.array([0, 0]))
     env.reset()
-    (vector.envs[1].unwrapped if where == "here" else vector).step = explode
+    (vector.envs[1].unwrapped if kind == "sync" else vector).step = explode
     with pytest.raises(RuntimeError):
         env.step(np.array([0, 0]))
     env.close()
     for monitor in env.monitors:
-        said = metadata_at(path_of(monitor, 0, "meta.json"))
-        assert said["exception"]["message"] == "the motor burns"
+        metadata = metadata_at(path_of(monitor, 0, "meta.json"))
+        assert metadata["exception"]["message"] == "the motor burns"
 
 
-def test_sub_environments_of_different_names_need_a_common_one(corridors, tmp_path):
-    """Results of one directory belong to one environment."""
+def test_different_env_ids_need_a_common_one(corridors, tmp_path):
     vector = corridors()
     vector.envs[0].spec = gymnasium.spec("CartPole-v1")
     with pytest.raises(InvalidArgument, match=r"CartPole-v1, None.*env_id="):
@@ -193,33 +189,28 @@ def test_sub_environments_of_different_names_need_a_common_one(corridors, tmp_pa
         play(env, 2)
 
 
-def test_it_draws_once_a_step_and_only_for_videos(tmp_path):
-    """One call of `render` is for all; without a running video there is none."""
+def test_render_is_called_once_a_step_and_only_for_videos(tmp_path):
     vector = VectorCorridor((3, 3), NEXT_STEP)
     with mjrec.Monitor(vector, tmp_path, lambda n: n == 0) as env:
         play(env, 3)
         assert vector.rendered == 4
         for _ in range(8):
             env.step(np.array([0, 0]))
-        # Arguments of the environment's own `close` are passed on.
-        env.close(reason="done")
+        env.close(reason="done")  # passed on to the environment
     assert vector.rendered == 4
     assert vector.closings == [{"reason": "done"}]
 
 
-def test_trajectories_hold_what_can_be_seen(tmp_path):
-    """Actions, rewards and observations; the last one is the episode's own."""
+def test_trajectories_hold_actions_rewards_and_observations(tmp_path):
+    """The last observation is the episode's own."""
     vector = VectorCorridor(LENGTHS, SAME_STEP)
-    with mjrec.Monitor(
-        vector, tmp_path, False, mode="evaluation", observations=True
-    ) as env:
+    options = {"mode": "evaluation", "observations": True}
+    with mjrec.Monitor(vector, tmp_path, False, **options) as env:
         env.reset()
         for step in range(3):
             env.step(np.array([step, 8 - step]))
-    first, second = (
-        mjrec.load_trajectory(path)
-        for path in sorted(tmp_path.glob("*.episode000000.h5"))
-    )
+    paths = sorted(tmp_path.glob("*.episode000000.h5"))
+    first, second = map(mjrec.load_trajectory, paths)
     assert first.actions.tolist() == [0, 1]
     assert second.actions.tolist() == [8, 7, 6]
     assert second.rewards.tolist() == [0.5] * 3
@@ -228,8 +219,7 @@ def test_trajectories_hold_what_can_be_seen(tmp_path):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_statistics_and_episode_info_are_those_of_gymnasium(tmp_path, mode):
-    """Lengths and returns, in the step that ends episodes and of all together."""
+def test_statistics_and_episode_info_equal_those_of_gymnasium(tmp_path, mode):
     theirs = RecordEpisodeStatistics(VectorCorridor(LENGTHS, mode))
     ours = mjrec.Monitor(
         VectorCorridor(LENGTHS, mode), tmp_path, False, episode_info=True
@@ -256,11 +246,10 @@ def test_statistics_and_episode_info_are_those_of_gymnasium(tmp_path, mode):
             assert len(lengths) == {NEXT_STEP: 4 + 3, SAME_STEP: 6 + 4}[mode]
 
 
-def test_a_masked_reset_leaves_the_others_alone(tmp_path):
-    """Their episodes go on; others are refused before anything is reset, if asked."""
-    with mjrec.Monitor(
-        VectorCorridor(LENGTHS, DISABLED), tmp_path, allow_early_reset=False
-    ) as env:
+def test_masked_reset_leaves_other_episodes_running(tmp_path):
+    """Without early resets, others are refused before anything is reset."""
+    vector = VectorCorridor(LENGTHS, DISABLED)
+    with mjrec.Monitor(vector, tmp_path, allow_early_reset=False) as env:
         both, first = np.array([True, True]), np.array([True, False])
         env.reset(seed=[5, 9], options={"reset_mask": both, "a": 1})
         for _ in range(2):
@@ -273,8 +262,8 @@ def test_a_masked_reset_leaves_the_others_alone(tmp_path):
         assert [m.episode_id for m in env.monitors] == [2, 1]
         env.step(np.array([0, 0]))
     episodes = list(mjrec.iter_episodes(tmp_path))
-    said = [(each.seed, each.options, each.length) for each in episodes]
-    assert said == [(5, {"a": 1}, 2), (9, {"a": 1}, 3)]
+    facts = [(each.seed, each.options, each.length) for each in episodes]
+    assert facts == [(5, {"a": 1}, 2), (9, {"a": 1}, 3)]
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
@@ -288,32 +277,29 @@ def test_a_masked_reset_leaves_the_others_alone(tmp_path):
         ({"mode": None}, {}, InvalidArgument, "autoreset_mode"),
     ],
 )
-def test_what_cannot_be_had_from_outside(tmp_path, made, options, error, message):
-    """The error says where it can be had, and nothing is left."""
+def test_unsupported_options_are_errors(tmp_path, made, options, error, message):
+    """The error names the alternative; no file is made."""
     with pytest.raises(error, match=message):
         mjrec.Monitor(VectorCorridor(**made), tmp_path / "run", **options)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_other_processes_know(tmp_path):
-    """Their name and the time of their steps are asked for."""
+def test_subprocess_environments_are_asked_for_name_and_timestep(tmp_path):
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}
-    # What was forked from a process with an OpenGL context hangs in its own.
+    # A process forked beside an OpenGL context hangs in its own.
     vector = AsyncVectorEnv(
         [lambda: gymnasium.make("Hopper-v5", **view)], context="spawn"
     )
     with mjrec.Monitor(vector, tmp_path) as env:
         play(env, 2, seed=1)
-    said = metadata_at(path_of(env.monitors[0], 0, "meta.json"))
-    assert (said["env_id"], said["fps"]) == ("Hopper-v5", "125")
-    assert said["recording_reason"].endswith("not objects in this process")
+    metadata = metadata_at(path_of(env.monitors[0], 0, "meta.json"))
+    assert (metadata["env_id"], metadata["fps"]) == ("Hopper-v5", "125")
+    assert metadata["recording_reason"].endswith("not objects in this process")
 
 
 def monitored_hopper(directory):
-    """Return what makes a monitored environment, in whichever process."""
-
     def make():
-        # In here, because a spawned process has imported nothing.
+        # A spawned process has imported nothing.
         import gymnasium
 
         import mjrec
@@ -328,8 +314,8 @@ def monitored_hopper(directory):
     ("context", "mode"),
     [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
 )
-def test_each_worker_records_its_own(tmp_path, context, mode):
-    """Videos are rendered from states, whole, also in daemonic processes."""
+def test_monitors_inside_subprocesses_record_whole_videos(tmp_path, context, mode):
+    """Subprocesses are daemonic."""
     make = monitored_hopper(tmp_path)
     env = AsyncVectorEnv([make, make], context=context, autoreset_mode=mode)
     workers = {process.pid for process in env.processes}
@@ -344,88 +330,83 @@ def test_each_worker_records_its_own(tmp_path, context, mode):
     assert not list(tmp_path.glob(".*"))
 
 
-# --- tiled videos --------------------------------------------------------------------
-
-
 def tiles_at(path, *, step):
-    """Return the position that each tile of a 2x2 grid of 32x64 frames shows."""
-    shown = []
+    """Return the positions in the tiles of a 2x2 grid of 32x64 frames."""
+    positions = []
     for frame in frames_of(path):
         assert frame.shape == (64, 128, 3)
         tiles = [frame[y, x : x + 64, 0] for y in (16, 48) for x in (0, 64)]
-        shown.append([round(int((row > 128).sum()) / step) - 1 for row in tiles])
-    return shown
+        positions.append([round(int((row > 128).sum()) / step) - 1 for row in tiles])
+    return positions
 
 
-@pytest.mark.parametrize("where", ["here", "one object"])
+@pytest.mark.parametrize("kind", ["sync", "one object"])
 @pytest.mark.parametrize("mode", MODES)
-def test_one_video_shows_all(corridors, tmp_path, mode, where):
-    """It follows the first's episodes and manifest; a frame that is hidden is noted."""
-    vector = corridors(mode, where=where, lengths=(2, 3, 2), size=(32, 64))
+def test_tiled_video_shows_all_sub_environments(corridors, tmp_path, mode, kind):
+    """It follows the first one's episodes and manifest; a hidden frame is noted."""
+    vector = corridors(mode, kind=kind, lengths=(2, 3, 2), size=(32, 64))
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         play(env, 8)
     first, second = (path_of(env.monitors[0], k, "tiled.mp4") for k in (0, 1))
     last = [0, 2, 0, -1] if mode == SAME_STEP else [2, 2, 2, -1]
-    # The last of the four is the padding.
-    step = 4 if where == "here" else 16
+    # The fourth tile is padding.
+    step = 4 if kind == "sync" else 16
     assert tiles_at(first, step=step) == [[0, 0, 0, -1], [1, 1, 1, -1], last]
     assert [tiles[0] for tiles in tiles_at(second, step=step)] == [0, 1, last[0]]
-    said = metadata_at(first.with_suffix(".meta.json"))
-    assert (said["tiled"], said["rows"], said["columns"]) == (True, 2, 2)
-    assert (said["complete"], said["length"], said["reward"]) == (True, 2, 1.0)
-    assert said.get("final_frame") == ("missing" if mode == SAME_STEP else None)
+    metadata = metadata_at(first.with_suffix(".meta.json"))
+    assert (metadata["tiled"], metadata["rows"], metadata["columns"]) == (True, 2, 2)
+    assert (metadata["complete"], metadata["length"]) == (True, 2)
+    assert metadata["reward"] == 1.0
+    assert metadata.get("final_frame") == ("missing" if mode == SAME_STEP else None)
     assert len(hashes_at(first.with_suffix(".framehash"))) == 3
     videos = mjrec.load_results(tmp_path)["videos"]
     names = {Path(video).name for video, _ in videos}
     assert names >= {first.name, path_of(env.monitors[0], 0, "mp4").name}
 
 
-@pytest.mark.parametrize("how", ["reset", "close", "error"])
-def test_a_video_that_is_cut_off_says_so(corridors, tmp_path, how):
-    """Its metadata has the reason."""
-    vector = corridors(where="one object", lengths=(2, 3, 2))
+@pytest.mark.parametrize("reason", ["reset", "close", "exception"])
+def test_incomplete_tiled_video_has_its_reason(corridors, tmp_path, reason):
+    vector = corridors(kind="one object", lengths=(2, 3, 2))
     with (
         contextlib.suppress(RuntimeError),
         mjrec.Monitor(vector, tmp_path, tiled=True) as env,
     ):
         env.reset()
         env.step(np.array([0, 0, 0]))
-        if how == "reset":
+        if reason == "reset":
             env.reset()
-        if how == "error":
+        if reason == "exception":
             raise RuntimeError("enough")
-    said = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
-    assert said["complete"] is False
-    assert said["reason"] == {"error": "exception"}.get(how, how)
-    assert (said["length"], said["frame_count"]) == (1, 2)
+    metadata = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
+    assert metadata["complete"] is False
+    assert metadata["reason"] == reason
+    assert (metadata["length"], metadata["frame_count"]) == (1, 2)
 
 
-def drawn_by(env):
-    """Return its frame; Gymnasium draws into whichever context is current."""
+def frame_of(env):
+    # Gymnasium draws into the current context.
     env.unwrapped.mujoco_renderer.viewer.make_context_current()
     return env.render()
 
 
 # Takes more than five seconds: every environment alone, and all in one video.
-def test_pixels_are_those_of_each_environment(tmp_path):
-    """Each tile is what its own environment's `render()` gives."""
+def test_tiles_equal_the_frames_of_each_environment(tmp_path):
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}
     several = [gymnasium.make("Hopper-v5", **view) for _ in range(2)]
     vector = SyncVectorEnv([lambda e=e: e for e in several])
     expected = []
-    # What earlier tests have left would take its OpenGL context along at any moment.
-    gc.collect()
+    gc.collect()  # frees OpenGL contexts of earlier tests
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         env.reset(seed=4)
         for _ in range(2):
             env.step(env.action_space.sample())
-            drawn = grid_frame([drawn_by(each) for each in several])
+            drawn = grid_frame([frame_of(each) for each in several])
             expected.append(hashlib.sha256(drawn.tobytes()).hexdigest())
     path = path_of(env.monitors[0], 0, "tiled.framehash")
     assert hashes_at(path)[1:] == expected
 
 
-def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
+def test_bad_frame_is_an_error_or_a_warning(tmp_path, caplog):
     """With `on_error="warn"` there is no tiled video; too few frames are an error."""
     vector = VectorCorridor(heights=(32, 48))
     with (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounded worker thread; what else it promises is seen in `test_video_writer`."""
+"""The bounded worker thread; `test_video_writer` tests its use."""
 
 import pytest
 from other_python import run_python
@@ -8,8 +8,8 @@ from mjrec.worker_thread import WorkerThread
 
 
 @pytest.mark.parametrize("end", [WorkerThread.close, WorkerThread.abort])
-def test_an_end_on_the_thread_itself_waits_for_nothing(end):
-    """As when the consumer's garbage collection ends the worker's owner."""
+def test_ending_a_worker_on_its_own_thread_does_not_block(end):
+    """Garbage collection in the consumer may end the worker's owner."""
     ended = []
     worker = WorkerThread(lambda _: ended.append(end(worker)), capacity=5, name="w")
     worker.put(1)
@@ -17,8 +17,8 @@ def test_an_end_on_the_thread_itself_waits_for_nothing(end):
     assert ended == [None]
 
 
-def test_neither_forks_nor_the_interpreter_wait_for_the_thread():
-    """A fork is told that it has none; a script whose consumer hangs still ends."""
+def test_forks_and_interpreter_exit_do_not_wait_for_the_thread():
+    """A fork's `put` raises; a script with a hanging consumer still exits."""
     code = (
         "import os, threading\n"
         "from mjrec.errors import ClosedError\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vector environments for the tests; they need no simulator."""
+"""Vector environments for the tests; none needs a simulator."""
 
 import json
 from pathlib import Path
@@ -21,10 +21,7 @@ DISABLED = AutoresetMode.DISABLED
 
 
 class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Several corridors in one object, each of its own length; draws all of them.
-
-    The frame of a corridor is 16 pixels wide for each step that was taken.
-    """
+    """Draws one corridor per sub-environment, 16 pixels wide for each step."""
 
     def __init__(
         self, lengths=(2, 3), mode=NEXT_STEP, *, render_mode="rgb_array", heights=None
@@ -92,7 +89,7 @@ def _frame(position, height):
 
 
 def play(env, steps, *, seed=None):
-    """Reset, and step so often; reset by mask what nobody else resets."""
+    """Reset, then take steps; mode DISABLED needs a masked reset after each episode."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
     for _ in range(steps):
@@ -103,17 +100,15 @@ def play(env, steps, *, seed=None):
 
 
 def path_of(monitor, episode, ending):
-    """Return where a file of a sub-environment's episode is."""
     name = f"openaigym.video.{monitor.infix}.video{episode:06d}.{ending}"
     return Path(monitor.directory) / name
 
 
 def shown(path, *, step=4):
-    """Return the corridor positions that a video shows, by its columns of colour."""
+    """Return the corridor positions in a video."""
     columns = [int((frame[0, :, 0] > 128).sum()) for frame in frames_of(path)]
     return [round(count / step) - 1 for count in columns]
 
 
 def metadata_at(path):
-    """Return what a JSON file holds."""
     return json.loads(path.read_text())

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an offline run of Weights & Biases has written.
+"""Reads files of offline runs of Weights & Biases.
 
-Its packages have no reader for it since 0.31. The format is LevelDB's log behind a
-header of seven bytes: blocks of 32 KiB, in which a record is one whole piece (1), or a
-first (2), middle ones (3) and a last one (4), each with its check sum and length.
+Its packages have had no reader since 0.31. The format is LevelDB's log behind a header
+of seven bytes: blocks of 32 KiB of pieces, each with checksum and length. A record is
+one whole piece (1), or a first (2), middle ones (3) and a last one (4).
 """
 
 import json
@@ -18,7 +18,6 @@ _WHOLE, _FIRST, _LAST = 1, 2, 4
 
 
 def records(path):
-    """Yield the records of a `.wandb` file."""
     for data in _pieces(path.read_bytes()):
         record = wandb_internal_pb2.Record()
         record.ParseFromString(data)
@@ -26,7 +25,7 @@ def records(path):
 
 
 def history(path):
-    """Return what was logged, without W&B's own."""
+    """Return logged rows, without keys of W&B itself."""
     return [
         _row(record.history.item)
         for record in records(path)
@@ -35,7 +34,7 @@ def history(path):
 
 
 def axes(path):
-    """Return what each metric, or each pattern of metrics, is drawn over."""
+    """Return the axis of each metric or pattern."""
     metrics = [r.metric for r in records(path) if r.HasField("metric")]
     return {m.name or m.glob_name: m.step_metric for m in metrics if m.step_metric}
 
@@ -43,7 +42,7 @@ def axes(path):
 def _row(items):
     row = {}
     for item in items:
-        # A video is several items, such as its path.
+        # A video is several nested items.
         *outer, last = list(item.nested_key) or [item.key]
         inner = row
         for key in outer:
@@ -63,11 +62,8 @@ def _pieces(data):
             continue
         _, length, kind = _PIECE.unpack_from(data, place)
         place += _PIECE.size
-        begun = (
-            data[place : place + length]
-            if kind in (_WHOLE, _FIRST)
-            else (begun + data[place : place + length])
-        )
+        piece = data[place : place + length]
+        begun = piece if kind in (_WHOLE, _FIRST) else begun + piece
         place += length
         if kind in (_WHOLE, _LAST):
             yield begun
