@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for words in files, however they are packed there; with nothing of mjrec."""
+"""A search for words in files, archives and compressed data, without mjrec."""
 
 import gzip
 import io
@@ -14,9 +14,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def find(path, words):
-    """Return where below a file or directory which of the words are.
+    """Return the pairs of place and word in a file or directory.
 
-    Names of files count, and so do those inside of archives and HDF5 files.
+    Names of files count, also in archives and HDF5 files.
     """
     needles = [
         (word, {word.lower().encode(encoding) for encoding in _ENCODINGS})
@@ -85,7 +85,7 @@ def _bytes(value):
 
 
 def _inside_png(where, content):
-    """Yield the texts in a frame that are compressed."""
+    """Yield the compressed texts of an image."""
     start = len(_PNG)
     while start < len(content):
         end = start + 12 + int.from_bytes(content[start : start + 4])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings that reports are made of."""
+"""Builders of small recordings for reports."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def entry(episode_id, **values):
 
 
 def write_journal(directory, infix, env_id, entries):
-    """Write what a monitor that was killed leaves."""
+    """Write the journal of a killed monitor."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"openaigym.episodes.{infix}.jsonl"
     info = {"gym_version": "mjrec-1", "env_id": env_id}
@@ -41,7 +41,6 @@ def write_journal(directory, infix, env_id, entries):
 
 
 def record(env, directory, episodes, **options):
-    """Record episodes of a fixed action."""
     monitor = mjrec.Monitor(env, directory, **options)
     for seed in range(episodes):
         monitor.reset(seed=seed)

@@ -16,32 +16,15 @@ from trajectories_by_hand import write_log
 
 from evaluations import write_recorded
 from mjrec import load_results
-from mjrec.commands import main
 from report_recordings import entry, write_journal
 
 PENDULUM = """
-<mujoco>
-  <worldbody>
-    <camera name="front" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>
-    <light pos="0 -1 2"/>
-    <body>
-      <joint type="hinge" axis="0 1 0" ref="90"/>
-      <geom type="capsule" size="0.05" fromto="0 0 0 0.5 0 0" rgba="1 0 0 1"/>
-    </body>
-  </worldbody>
-</mujoco>
+<mujoco><worldbody>
+  <camera name="front" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/><light pos="0 -1 2"/>
+  <body><joint type="hinge" axis="0 1 0" ref="90"/>
+    <geom type="capsule" size="0.05" fromto="0 0 0 0.5 0 0" rgba="1 0 0 1"/></body>
+</worldbody></mujoco>
 """
-
-
-@pytest.fixture
-def mjrec(capsys):
-    """Run the command, check its exit status, and return its output."""
-
-    def run(*arguments, status=0):
-        assert main([*map(str, arguments)]) == status
-        return capsys.readouterr()
-
-    return run
 
 
 def json_lines(text):
@@ -52,9 +35,9 @@ CHEETAH = ("record", "HalfCheetah-v5", "--size", "64x48", "--max-steps", 3)
 
 
 # Takes more than five seconds: each of three videos starts renderers.
-def test_record_writes_scheduled_videos_and_statistics_of_all(mjrec, tmp_path):
+def test_record_writes_scheduled_videos_and_statistics_of_all(command, tmp_path):
     run = (*CHEETAH, "--out", tmp_path, "--episodes", 10, "--seed", 0)
-    out = mjrec(*run).out
+    out = command(*run).out
     assert "episode 9 (10/10): 3 steps" in out
     assert "video000008.mp4" in out
     results = load_results(tmp_path)
@@ -62,31 +45,31 @@ def test_record_writes_scheduled_videos_and_statistics_of_all(mjrec, tmp_path):
     assert videos_in(tmp_path) == [0, 1, 8]
     assert metadata_of(tmp_path, 0)["camera"] == "track"
     assert frames_in(tmp_path, 0)[0].shape == (48, 64, 3)
-    listed = json_lines(mjrec("list", tmp_path, "--json").out)
+    listed = json_lines(command("list", tmp_path, "--json").out)
     assert [each["episode_id"] for each in listed if each["video"]] == [0, 1, 8]
     assert listed[8]["video"] == Path(results["videos"][2][0]).name
     assert isinstance(listed[0]["seed"], int)
 
 
 @pytest.mark.thorough
-def test_resumed_run_equals_an_uninterrupted_one(mjrec, tmp_path):
+def test_resumed_run_equals_an_uninterrupted_one(command, tmp_path):
     for out, runs in (("whole", [2]), ("parts", [1, 1])):
         for episodes in runs:
             run = (*CHEETAH, "--out", tmp_path / out, "--seed", 3, "--resume")
-            mjrec(*run, "--episodes", episodes)
+            command(*run, "--episodes", episodes)
     whole, parts = load_results(tmp_path / "whole"), load_results(tmp_path / "parts")
     assert whole["episode_rewards"] == parts["episode_rewards"]
     assert metadata_of(tmp_path / "parts", 1)["episode_id"] == 1
 
 
-def test_keep_lists_only_kept_videos_as_text_and_as_json(mjrec, tmp_path):
+def test_keep_lists_only_kept_videos_as_text_and_as_json(command, tmp_path):
     run = (*CHEETAH, "--seed", 0, "--episodes", 3, "--workers", 0, "--keep", "worst:1")
-    out = mjrec(*run, "--out", tmp_path / "a").out
+    out = command(*run, "--out", tmp_path / "a").out
     rewards = load_results(tmp_path / "a")["episode_rewards"]
     is_worst = [reward == min(rewards) for reward in rewards]
     assert "1 video:" in out
     assert [f"video00000{number}.mp4" in out for number in range(3)] == is_worst
-    summary = json.loads(mjrec(*run, "--out", tmp_path / "b", "--json").out)
+    summary = json.loads(command(*run, "--out", tmp_path / "b", "--json").out)
     assert (summary["seed"], summary["interrupted"]) == (0, False)
     assert [episode["length"] for episode in summary["episodes"]] == [3] * 3
     assert [episode["pending"] for episode in summary["episodes"]] == is_worst
@@ -110,21 +93,21 @@ def test_keep_lists_only_kept_videos_as_text_and_as_json(mjrec, tmp_path):
         (["HalfCheetah-v5", "--env-kwargs", '{"no": [NaN]}'], ["'no'", "NaN"]),
     ],
 )
-def test_bad_input_gives_one_error_and_no_directory(mjrec, tmp_path, arguments, words):
-    err = mjrec("record", *arguments, "--out", tmp_path / "out", status=1).err
+def test_bad_input_is_one_error_and_no_directory(command, tmp_path, arguments, words):
+    err = command("record", *arguments, "--out", tmp_path / "out", status=1).err
     # MuJoCo may warn of the model before that.
     assert [line[:7] for line in err.splitlines()].count("mjrec: ") == 1
     assert [each for each in words if each not in err] == []
     assert not (tmp_path / "out").exists()
 
 
-def test_existing_recordings_need_force_or_resume(mjrec, tmp_path):
+def test_existing_recordings_need_force_or_resume(command, tmp_path):
     run = (*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
-    mjrec(*run)
-    err = mjrec(*run, status=1).err
+    command(*run)
+    err = command(*run, status=1).err
     assert "--resume" in err
     assert "--force" in err
-    mjrec(*run, "--force", "--episodes", 2)
+    command(*run, "--force", "--episodes", 2)
     assert len(load_results(tmp_path)["episode_lengths"]) == 2
 
 
@@ -146,33 +129,27 @@ gymnasium.register("Nan-v0", Nan, disable_env_checker=True)
 
 
 @pytest.mark.parametrize(("allowed", "status"), [([], 1), (["--allow-nan"], 0)])
-def test_nan_returns_fail_unless_allowed(mjrec, tmp_path, monkeypatch, allowed, status):
+def test_nan_fails_unless_allowed(command, tmp_path, monkeypatch, allowed, status):
     monkeypatch.chdir(tmp_path)
     Path("nan_env.py").write_text(NAN)
     run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, *allowed)
-    out = mjrec("record", *run, "--out", "r", "--schedule", "none", status=status).out
+    out = command("record", *run, "--out", "r", "--schedule", "none", status=status).out
     assert "NaN or infinite: 2 returns" in out
     small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
-    out, err = mjrec("evaluate", *run, *small, "--out", "e", status=status)
+    out, err = command("evaluate", *run, *small, "--out", "e", status=status)
     # Without videos the frame rate does not matter.
     assert "does not declare a frame rate" not in err
     assert "NaN or infinite: 2 returns" in out
     assert "best" not in out
 
 
-def test_wrong_usage_is_status_2(mjrec):
-    with pytest.raises(SystemExit) as left:
-        mjrec("record", "HalfCheetah-v5", "--no-such-option")
-    assert left.value.code == 2
-
-
 # Takes more than five seconds: each of three videos starts renderers.
-def test_cameras_make_one_video_each_or_one_tiled_video(mjrec, tmp_path):
+def test_cameras_make_one_video_each_or_one_tiled_video(command, tmp_path):
     """A model file plays at 60 frames per second."""
     (tmp_path / "model.xml").write_text(PENDULUM)
     run = ("record", tmp_path / "model.xml", "--max-steps", 2, "--size", "64x48")
     run = (*run, "--camera", "front", "--camera", -1)
-    out = mjrec(*run, "--out", tmp_path / "a").out
+    out = command(*run, "--out", tmp_path / "a").out
     videos = [path.name for path in (tmp_path / "a").glob("*.mp4")]
     assert len(videos) == 2
     assert "2 videos:" in out
@@ -180,7 +157,7 @@ def test_cameras_make_one_video_each_or_one_tiled_video(mjrec, tmp_path):
     about = metadata_of(tmp_path / "a", 0)
     assert (about["camera"], about["fps"]) == ("front", "60")
     more = ("--tiled", "--annotate", "--name-prefix", "rl-video")
-    mjrec(*run, "--out", tmp_path / "b", *more)
+    command(*run, "--out", tmp_path / "b", *more)
     assert frames_in(tmp_path / "b", 0)[0].shape == (48, 128, 3)
     about = metadata_of(tmp_path / "b", 0)
     assert about["tiled"]
@@ -188,51 +165,51 @@ def test_cameras_make_one_video_each_or_one_tiled_video(mjrec, tmp_path):
     assert (tmp_path / "b" / "rl-video-episode-0.mp4").exists()
 
 
-def test_list_shows_pending_videos_clips_and_the_best_episode(mjrec, tmp_path):
+def test_list_shows_pending_videos_clips_and_the_best_episode(command, tmp_path):
     entries = [entry(0, reward=float("nan")), entry(1, recording="deferred")]
     write_journal(tmp_path, "0.7", "X-v0", entries)
     trajectory = write_log(tmp_path, 1, steps=2)
     clip = tmp_path / "openaigym.video.0.7.video000000.step000001.mp4"
     clip.touch()
     clip.with_suffix(".meta.json").touch()
-    out = mjrec("list", tmp_path).out
+    out = command("list", tmp_path).out
     assert out.count("pending") == 1
     assert out.splitlines()[-2:] == ["Other videos:", f"  {clip.name}"]
     assert "monitor" not in out
-    first, second = json_lines(mjrec("list", tmp_path, "--json").out)
+    first, second = json_lines(command("list", tmp_path, "--json").out)
     assert (first["pending"], first["trajectory"]) == (False, None)
     assert (second["pending"], second["trajectory"]) == (True, trajectory.name)
     assert second["video"] is None
     # Sub-environments number their episodes separately; a NaN is never the best.
     write_journal(tmp_path, "1.7", "X-v0", [entry(0), entry(1, reward=9.0)])
-    lines = mjrec("list", tmp_path).out.splitlines()
+    lines = command("list", tmp_path).out.splitlines()
     assert lines[0].split()[:2] == ["monitor", "episode"]
     assert [line.split()[0] for line in lines[1:5]] == ["0.7", "0.7", "1.7", "1.7"]
     assert lines[5] == "Best return: episode 1 of 1.7, 9"
 
 
-def test_list_shows_all_monitor_directories_below(mjrec, tmp_path):
+def test_list_shows_all_monitor_directories_below(command, tmp_path):
     for name, count in (("b", 1), ("a", 2)):
         write_journal(tmp_path / name, "0.7", "X-v0", map(entry, range(count)))
     (tmp_path / "notes").mkdir()
     (tmp_path / "c.txt").touch()
-    out = mjrec("list", tmp_path).out
+    out = command("list", tmp_path).out
     headings = [line for line in out.splitlines() if line.endswith(":")]
     assert headings == [f"{tmp_path / name}:" for name in "ab"]
     assert out.count("truncated") == 3
-    lines = json_lines(mjrec("list", tmp_path, "--json").out)
+    lines = json_lines(command("list", tmp_path, "--json").out)
     listed = [(line["directory"], line["episode_id"]) for line in lines]
     assert listed == [("a", 0), ("a", 1), ("b", 0)]
 
 
-def test_list_shows_episodes_of_a_finished_or_running_evaluation(mjrec, tmp_path):
+def test_list_shows_episodes_of_a_finished_or_running_evaluation(command, tmp_path):
     """While it runs, no videos have been selected."""
     name = "openaigym.video.0.batch.video000000.mp4"
     write_recorded(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
     (tmp_path / "a-x" / name).touch()
 
     def rows(directory):
-        out = mjrec("list", directory).out
+        out = command("list", directory).out
         return [line.split() for line in out.splitlines() if "/" in line]
 
     listed = rows(tmp_path)
@@ -242,7 +219,7 @@ def test_list_shows_episodes_of_a_finished_or_running_evaluation(mjrec, tmp_path
         ["a/x", "7", "0", "10", "failed"],
     ]
     assert [listed[4][-1], len(listed)] == ["pending", 8]
-    first, *_ = json_lines(mjrec("list", tmp_path, "--json").out)
+    first, *_ = json_lines(command("list", tmp_path, "--json").out)
     assert (first["task"], first["seed"], first["reward"]) == ("a/x", 0, 3.0)
     assert (first["video"], first["pending"]) == (str(tmp_path / "a-x" / name), False)
     write_recorded(tmp_path / "begun", ["a/x"], finished=False)
@@ -253,11 +230,11 @@ def test_list_shows_episodes_of_a_finished_or_running_evaluation(mjrec, tmp_path
     ]
 
 
-def test_list_of_an_empty_directory_is_no_error(mjrec, tmp_path):
+def test_list_of_an_empty_directory_is_no_error(command, tmp_path):
     handlers = logging.getLogger("mjrec").handlers[:]
-    assert mjrec("list", tmp_path).out == f"No episodes are recorded in {tmp_path}.\n"
-    assert mjrec("list", tmp_path, "--json").out == ""
-    assert "nothing" in mjrec("list", tmp_path / "nothing", status=1).err
+    assert command("list", tmp_path).out == f"No episodes are recorded in {tmp_path}.\n"
+    assert command("list", tmp_path, "--json").out == ""
+    assert "nothing" in command("list", tmp_path / "nothing", status=1).err
     # Otherwise each later command of this process would log each message again.
     assert logging.getLogger("mjrec").handlers == handlers
 
@@ -276,27 +253,27 @@ def test_list_is_silent_when_its_reader_closes_the_pipe(tmp_path):
 LOG = "openaigym.trajectory.0.7.episode00000"
 
 
-def test_recover_lists_recovered_files(mjrec, tmp_path):
+def test_recover_lists_recovered_files(command, tmp_path):
     text, as_json = tmp_path / "text", tmp_path / "json"
     for directory in (text, as_json):
         directory.mkdir()
         write_log(directory, 0)
         write_log(directory, 1, ended=False)
-    assert mjrec("recover", text).out.splitlines() == [
+    assert command("recover", text).out.splitlines() == [
         f"Recovered in {text}:",
         f"  {LOG}0.h5: 4 steps",
         f"  {LOG}1.h5: 4 steps, incomplete: killed",
         "  openaigym.episode_batch.0.7.stats.json: 0 episodes",
         "  openaigym.manifest.0.7.manifest.json: 0 videos, 2 pending: mjrec render",
     ]
-    assert mjrec("recover", text).out == f"Nothing to recover in {text}.\n"
-    done = json.loads(mjrec("recover", as_json, "--timeout", 0, "--json").out)
+    assert command("recover", text).out == f"Nothing to recover in {text}.\n"
+    done = json.loads(command("recover", as_json, "--timeout", 0, "--json").out)
     assert done["directory"] == str(as_json)
     assert done["files"][0] == {"name": f"{LOG}0.h5", "what": "4 steps"}
     assert (done["failures"], done["open_monitors"]) == ([], [])
 
 
-def test_recover_lists_failures(mjrec, tmp_path):
+def test_recover_lists_failures(command, tmp_path):
     """It leaves the log of a newer version unchanged."""
     write_log(tmp_path, 0)
     [log] = tmp_path.glob("*.log")
@@ -304,15 +281,15 @@ def test_recover_lists_failures(mjrec, tmp_path):
     newer = journal.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
     journal.write_bytes(newer)
     content = log.read_bytes()
-    out = mjrec("recover", tmp_path, status=1).out
+    out = command("recover", tmp_path, status=1).out
     assert "Not recovered:\n" in out
     assert f"  {log.name}: " in out
     assert log.read_bytes() == content
-    err = mjrec("recover", tmp_path / "missing", status=1).err
+    err = command("recover", tmp_path / "missing", status=1).err
     assert err.startswith("mjrec: Cannot recover")
 
 
-def test_warnings_and_policy_errors_are_shown_once(mjrec, tmp_path, monkeypatch):
+def test_warnings_and_policy_errors_are_shown_once(command, tmp_path, monkeypatch):
     """Over many episodes, and over several workers of an evaluation."""
     monkeypatch.chdir(tmp_path)
     # A spring too stiff for steps of a tenth of a second.
@@ -323,14 +300,14 @@ def test_warnings_and_policy_errors_are_shown_once(mjrec, tmp_path, monkeypatch)
         "def crash(observation):\n    raise RuntimeError('boom')\n"
     )
     run = ("--out", "a", "--episodes", 3, "--schedule", "none", "--max-steps", 50)
-    err = mjrec("record", "unstable.xml", *run).err
+    err = command("record", "unstable.xml", *run).err
     assert err.count("The simulation is unstable") == 1
     few = ("--keep", "none", "--episodes", 2, "--num-seeds", 2, "--workers", 2)
     for command in (
         ("record", "unstable.xml", "--out", "b"),
         ("evaluate", "Hopper-v5", "CartPole-v1", "--out", "c", *few),
     ):
-        err = mjrec(*command, "--policy", "crash_policy:crash", status=1).err
+        err = command(*command, "--policy", "crash_policy:crash", status=1).err
         assert err.count('crash_policy.py", line 2, in crash') == 1
 
 
@@ -348,7 +325,7 @@ def endless(directory):
     [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)],
     default=2,
 )
-def test_signals_close_files_and_keep_all_episodes(signum, status, tmp_path):
+def test_signals_close_files_and_keep_all_episodes(signum, status, command, tmp_path):
     """The command names pending videos, and `mjrec render` draws them."""
     process = subprocess.Popen(
         endless(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -362,7 +339,7 @@ def test_signals_close_files_and_keep_all_episodes(signum, status, tmp_path):
     assert set(load_results(tmp_path)["episode_lengths"]) == {20}
     if not videos_in(tmp_path):
         assert f"pending: mjrec render {tmp_path}".encode() in out + errors
-    assert main(["render", str(tmp_path), "--workers", "1"]) == 0
+    command("render", tmp_path, "--workers", "1")
     assert len(frames_in(tmp_path, 0)) == 21
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
