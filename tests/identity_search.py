@@ -18,15 +18,12 @@ def find(path, words):
 
     Names of files count, also in archives and HDF5 files.
     """
-    needles = [
-        (word, {word.lower().encode(encoding) for encoding in _ENCODINGS})
-        for word in words
-    ]
+    forms = [(word, {word.lower().encode(e) for e in _ENCODINGS}) for word in words]
     return [
         (where, word)
         for where, content in _everything(path)
-        for word, forms in needles
-        if any(form in content.lower() for form in forms)
+        for word, encoded in forms
+        if any(form in content.lower() for form in encoded)
     ]
 
 

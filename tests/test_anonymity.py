@@ -221,24 +221,19 @@ def test_anonymous_recordings_have_equal_contents(recorded, anonymous):
     assert rendered == hashes_at(hashes)
 
 
-def test_files_are_renamed_with_all_references(anonymous):
+def test_names_become_placeholders_in_files_and_references(anonymous):
     manifest = read(anonymous / "openaigym.manifest.0.user-final.manifest.json")
     assert manifest["stats"] == "openaigym.episode_batch.0.user-final.stats.json"
     for names in manifest["videos"]:
         assert all((anonymous / name).is_file() for name in names)
-    assert {t.facts["infix"] for t in trajectories(anonymous)} == {"0.user-final"}
     metadata = read(anonymous / manifest["videos"][0][1])
     assert metadata["also_named"] == "user-run-episode-0.mp4"
     assert metadata["encoder_version"]["cmdline"][-1] == manifest["videos"][0][0]
-
-
-def test_placeholders_replace_names_in_facts(anonymous):
-    """Parts without names stay."""
-    [trajectory, _] = trajectories(anonymous)
-    assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
-    kwargs = trajectory.facts["environment"]["kwargs"]
-    assert kwargs["xml_file"] == "<path>/models/robot.xml"
-    details = read(next(anonymous.glob("*.manifest.json")))["mjrec"]
+    facts, other = (trajectory.facts for trajectory in trajectories(anonymous))
+    assert facts["infix"] == other["infix"] == "0.user-final"
+    assert facts["options"] == {"goal": "<path>/goal.npy"}
+    assert facts["environment"]["kwargs"]["xml_file"] == "<path>/models/robot.xml"
+    details = manifest["mjrec"]
     assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]
     provenance, python = details["provenance"], Path(sys.executable).name
     assert provenance["command"] == [python, "identity_recording.py", "runs"]

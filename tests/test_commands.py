@@ -303,11 +303,11 @@ def test_warnings_and_policy_errors_are_shown_once(command, tmp_path, monkeypatc
     err = command("record", "unstable.xml", *run).err
     assert err.count("The simulation is unstable") == 1
     few = ("--keep", "none", "--episodes", 2, "--num-seeds", 2, "--workers", 2)
-    for command in (
+    for run in (
         ("record", "unstable.xml", "--out", "b"),
         ("evaluate", "Hopper-v5", "CartPole-v1", "--out", "c", *few),
     ):
-        err = command(*command, "--policy", "crash_policy:crash", status=1).err
+        err = command(*run, "--policy", "crash_policy:crash", status=1).err
         assert err.count('crash_policy.py", line 2, in crash') == 1
 
 

@@ -33,7 +33,7 @@ say(
 
 
 def test_confined_process_reaches_only_its_files(tmp_path, monkeypatch):
-    """It has no home, token or network, and what drawing needs."""
+    """It sees no token, network or real home, and keeps what drawing needs."""
     folders = {name: tmp_path / name for name in ("readable", "other", "place")}
     for folder in (*folders.values(), tmp_path / "modules"):
         folder.mkdir()

@@ -126,13 +126,9 @@ def test_unusable_dm_control_is_an_error_with_the_fix(tmp_path, monkeypatch):
 def test_recorded_arguments_are_those_of_named_tasks():
     """Those of a user's own environment are unknown."""
     made = {"seed": 5, "max_steps": 3, "kwargs": {"task_kwargs": {"time_limit": 2}}}
-    for env, kwargs in (
-        (
-            named("cartpole-swingup", **made).environment,
-            {"task_kwargs": {"random": 5, "time_limit": 2}},
-        ),
-        (suite.load("cartpole", "swingup"), None),
-    ):
+    ours = named("cartpole-swingup", **made).environment
+    known = {"task_kwargs": {"random": 5, "time_limit": 2}}
+    for env, kwargs in ((ours, known), (suite.load("cartpole", "swingup"), None)):
         recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup")
         assert recorded.environment["kwargs"] == kwargs
 

@@ -70,7 +70,7 @@ def hang_at(tmp_path, monkeypatch):
     monkeypatch.setenv("MJREC_TIMEOUT", "0.3")
 
     def run(text):
-        # `exit` keeps the shell as the parent of its command, as wrapper scripts do.
+        # The shell stays as the parent of its command, like a wrapper script.
         program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
 

@@ -93,7 +93,7 @@ def test_episodes_of_several_monitors_are_sorted_by_time(tmp_path):
 
 
 def test_each_environment_of_each_directory_is_a_task(tmp_path):
-    """A directory with several environments is a problem."""
+    """It reports a directory with several environments."""
     a, b = tmp_path / "a", tmp_path / "b"
     write_journal(a, "0.a", "X-v0", [entry(0)])
     write_journal(a, "1.a", "Y-v0", [entry(0), entry(1)])
@@ -240,10 +240,7 @@ def test_evaluation_without_results_shows_monitors(tmp_path, broken, content, re
 
 @pytest.mark.parametrize(
     "rewards",
-    [
-        (2.0, 5.0, 5.0, 1.0, 1.0, 2.0),
-        *((5.0, 5.0), (9.0, None, 1.0, 2.0), (np.nan, -np.inf, 0.0, 1.0)),
-    ],
+    [(2, 5, 5, 1, 1, 2), (5.0, 5.0), (9, None, 1, 2), (np.nan, -np.inf, 0.0, 1.0)],
 )
 def test_roles_are_those_of_the_selection_rule(tmp_path, rewards):
     write_recorded(tmp_path, ["a/x"], rewards=rewards)

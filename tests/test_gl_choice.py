@@ -49,7 +49,7 @@ def test_backend_comes_from_argument_variable_or_first_that_renders(code, variab
 
 
 def test_mujoco_imported_later_uses_the_backend():
-    """Importing mjrec.gl imports none."""
+    """Importing mjrec.gl imports neither mujoco nor OpenGL."""
     code = (
         "import mjrec.gl\n"
         "assert not {'mujoco', 'OpenGL', 'glfw', 'dm_control'} & set(sys.modules)\n"

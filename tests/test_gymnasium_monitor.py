@@ -158,10 +158,8 @@ def test_automatic_resets_begin_episodes(make_corridor, tmp_path):
                 self.reset()
             return result
 
-    for env, steps, bar in (
-        (gymnasium.wrappers.Autoreset(make_corridor()), 7, BAR),
-        (Looping(), 6, BAR[:3]),
-    ):
+    autoreset = gymnasium.wrappers.Autoreset(make_corridor())
+    for env, steps, bar in ((autoreset, 7, BAR), (Looping(), 6, BAR[:3])):
         with mjrec.Monitor(env, tmp_path, lambda _: True, force=True) as monitor:
             monitor.reset()
             for _ in range(steps):

@@ -59,10 +59,13 @@ def changed(env, part, **values):
 
 
 def test_most_wrappers_of_gymnasium_are_no_obstacle():
+    """With a requested view, no wrapper is one."""
     env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(make()))
     env = wrappers.NormalizeReward(wrappers.Autoreset(env))
     assert gymnasium_scenes(env).obstacle is None
     assert gymnasium_scenes(make(render_mode=None)).obstacle is None
+    for asked in ({"camera": -1}, {"height": 32}, {"width": 32}):
+        assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
 
 
 OBSTACLES = [
@@ -127,7 +130,7 @@ viewer_of = operator.attrgetter(VIEWER)
         ),
     ],
 )
-def test_additions_to_the_viewer_are_obstacles_of_a_frame(change, words):
+def test_additions_to_the_viewer_are_momentary_obstacles(change, words):
     """`env.render()` shows them, and the scene does not."""
     env = make()
     scene = scene_of(env)
@@ -137,11 +140,6 @@ def test_additions_to_the_viewer_are_obstacles_of_a_frame(change, words):
     change(env)
     assert words in str(scene.obstacle())
     env.close()
-
-
-@pytest.mark.parametrize("asked", [{"camera": -1}, {"height": 32}, {"width": 32}])
-def test_requested_views_ignore_wrappers(asked):
-    assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
 
 
 def test_replaced_renderer_replaces_camera_and_options():
