@@ -187,7 +187,7 @@ def example_case(path):
     return pytest.param(path, id=path.stem, marks=getattr(pytest.mark, marker))
 
 
-@pytest.mark.parametrize("example", map(example_case, EXAMPLES))
+@pytest.mark.parametrize("example", [*map(example_case, EXAMPLES)])
 def test_example_runs_alone_and_is_listed(example, tmp_path):
     needs_extras(example.read_text())
     run(sys.executable, shutil.copy(example, tmp_path), cwd=tmp_path)
