@@ -165,19 +165,17 @@ def test_anonymous_archives_are_valid_and_contain_no_identity(author, packed):
         assert mjrec.verify(archive, level="files").failures == ()
 
 
-PLACES = [
-    *(r"manifest\.json$", r"meta\.json$", r"\.jsonl$", r"\.h5 > /@facts"),
-    *(r"diary\.video\d+\.json$", r"monitor\.csv \(name\)$", r"\.mp4 \(name\)"),
-    *(r"model.*zip > source/robot\.xml$", r"model.*zip > source/logo\.png \(zTXt\)"),
-    *(r"stats\.json \(name\)", r"environment\.json$", r"ro-crate-metadata\.json$"),
-    *(r"CITATION\.cff$", r"README\.md$", r"statistics\.csv$"),
-    *[r"mjb\.gz \(unpacked\)"] * MODELS_HAVE_PATHS,
-]
-
-
 def test_search_finds_the_identity_in_each_place_of_named_archives(packed):
     found = [place for place, _ in find(packed["named"], WORDS)]
-    for where in PLACES:
+    for where in (
+        *(r"manifest\.json$", r"meta\.json$", r"\.jsonl$", r"\.h5 > /@facts"),
+        *(r"diary\.video\d+\.json$", r"monitor\.csv \(name\)$", r"\.mp4 \(name\)"),
+        r"model.*zip > source/robot\.xml$",
+        r"model.*zip > source/logo\.png \(zTXt\)",
+        *(r"stats\.json \(name\)", r"environment\.json$", r"ro-crate-metadata\.json$"),
+        *(r"CITATION\.cff$", r"README\.md$", r"statistics\.csv$"),
+        *[r"mjb\.gz \(unpacked\)"] * MODELS_HAVE_PATHS,
+    ):
         assert any(re.search(where, place) for place in found), where
 
 
