@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dm_control task whose model is another one in each episode."""
+"""A dm_control task with another model in each episode."""
 
 
 def growing():

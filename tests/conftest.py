@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests share: OpenGL's backend, small environments, small helpers."""
+"""Shared fixtures: OpenGL's backend, small environments and helpers."""
 
 import gc
 import importlib.util
@@ -19,12 +19,13 @@ from packed_runs import record_pendulum
 from processes import children, kill_children
 from trajectories_by_hand import Painter
 
+from mjrec.commands import main
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.rendering import finish
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
-# It is in an environment of its own.
+# It runs in its own environment.
 collect_ignore = ["test_stable_baselines3.py"]
 if importlib.util.find_spec("stable_baselines3"):
     collect_ignore.clear()
@@ -32,7 +33,7 @@ if importlib.util.find_spec("stable_baselines3"):
 
 @pytest.fixture(scope="session", autouse=True)
 def own_state_home(tmp_path_factory):
-    """Keep the list of the tests' models out of the home directory."""
+    """Keep lists of models and caches out of the home directory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
@@ -41,14 +42,14 @@ def own_state_home(tmp_path_factory):
 
 @pytest.fixture
 def default_signals():
-    """Have child processes start with SIGINT and SIGHUP as in a terminal.
+    """Start child processes with SIGINT and SIGHUP as in a terminal.
 
-    Under `nohup` and in a background job they are ignored, in every child too.
+    `nohup` and background jobs ignore them, and so would every child.
     """
     earlier = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if earlier[signal.SIGHUP] is signal.SIG_IGN:
-        # A child starts without it; this process lives on, as `nohup` asks for.
+        # Children do not inherit a handler; this process survives, as `nohup` asks.
         signal.signal(signal.SIGHUP, lambda *_: None)
     yield
     for signum, handler in earlier.items():
@@ -56,12 +57,11 @@ def default_signals():
 
 
 def pytest_report_header():
-    """Say what the frames come from."""
     return [f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"dm_control: {_HAS_DM_CONTROL}"]
 
 
 class Corridor(gymnasium.Env):
-    """Walks `length` steps and ends; draws its position. Needs no simulator."""
+    """Ends after `length` steps and draws its position, without a simulator."""
 
     metadata: ClassVar = {
         "render_modes": ["rgb_array", "ansi", "rgb_array_list"],
@@ -102,11 +102,10 @@ class Corridor(gymnasium.Env):
 
 @pytest.fixture(autouse=True)
 def free_dm_control_scenes(request):
-    """Free the OpenGL contexts of dm_control on the thread that made them.
+    """Free dm_control's OpenGL contexts on the thread that made them.
 
-    Its environments are garbage in cycles. Where a later test's other thread happens
-    to collect them, dm_control fails at making a context current that another
-    thread holds, and that test gets the blame.
+    Its environments are cyclic garbage. If another thread of a later test collects
+    them, dm_control fails there, because this thread holds the context.
     """
     yield
     if request.node.get_closest_marker("dm_control"):
@@ -115,7 +114,7 @@ def free_dm_control_scenes(request):
 
 @pytest.fixture(scope="session")
 def pendulums(tmp_path_factory):
-    """Return what records once in a session, for tests that change nothing."""
+    """Return a function that records once per session, for tests that only read."""
     made = {}
 
     def recorded(episodes, **options):
@@ -131,18 +130,17 @@ def pendulums(tmp_path_factory):
 
 @pytest.fixture
 def corridor():
-    """An environment of three steps that draws 48x32 frames."""
+    """Return an environment of three steps with 48x32 frames."""
     return Corridor()
 
 
 @pytest.fixture
 def make_corridor():
-    """The class of `corridor`, for other arguments."""
+    """Return the class of `corridor`."""
     return Corridor
 
 
 def run_episodes(env, count, *, seed=None):
-    """Run whole episodes of a Gymnasium environment."""
     for _ in range(count):
         env.reset(seed=seed)
         done = False
@@ -153,8 +151,18 @@ def run_episodes(env, count, *, seed=None):
 
 @pytest.fixture
 def play():
-    """Return `run_episodes`."""
     return run_episodes
+
+
+@pytest.fixture
+def command(capsys):
+    """Return a function that runs `mjrec`, checks its status and returns its output."""
+
+    def run(*arguments, status=0):
+        assert main([*map(str, arguments)]) == status
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture
@@ -165,7 +173,7 @@ def kill_ffmpeg():
 
 @pytest.fixture
 def no_process_is_left():
-    """See that a test leaves no process that was not there before, zombies included."""
+    """Check that a test leaves no process, not even a zombie."""
     before = children()
     yield
     gc.collect()
@@ -174,7 +182,7 @@ def no_process_is_left():
 
 @pytest.fixture
 def stuck_encoder(tmp_path_factory, monkeypatch):
-    """Let every encoder begin and never go on; the returned file says that one has."""
+    """Let encoders hang; the returned file exists when one has begun."""
     begun = tmp_path_factory.mktemp("encoder") / "begun"
     program = begun.with_name("ffmpeg")
     program.write_text(
@@ -188,7 +196,7 @@ def stuck_encoder(tmp_path_factory, monkeypatch):
 
 @pytest.fixture
 def painter(monkeypatch):
-    """Draw without processes and without OpenGL; the encoder is the real one."""
+    """Draw without processes and OpenGL; the encoder is real."""
     painter = Painter()
     monkeypatch.setattr(finish, "WorkerPool", lambda count, **rest: painter)
     return painter
@@ -196,13 +204,13 @@ def painter(monkeypatch):
 
 @pytest.fixture
 def names():
-    """Return the sorted names in a directory, hidden ones too."""
+    """Return a function that lists all names in a directory, sorted."""
     return lambda directory: sorted(p.name for p in Path(directory).iterdir())
 
 
 @pytest.fixture
 def halfcheetah():
-    """A small HalfCheetah-v5 that can be drawn."""
+    """Return a small HalfCheetah-v5 that can be drawn."""
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
     yield env
     env.close()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validates an RO-Crate with roc-validator, without a network.
 
-Run by a Python of its own, which has `roc-validator` and `rocrate`. The one thing that
-the validator fetches is the JSON-LD context of RO-Crate; `rocrate` ships that of a
-later version, which has all the terms of 1.1.
+A Python with `roc-validator` and `rocrate` runs it. The validator fetches only the
+JSON-LD context; `rocrate` contains a later one with all terms of version 1.1.
 """
 
 import json
@@ -12,7 +11,7 @@ from importlib import resources
 
 
 def main(folder):
-    """Print what is wrong with the crate in a folder, and return how much it is."""
+    """Print the problems of the crate in a folder, and return their number."""
     context = json.loads(
         resources.files("rocrate").joinpath("data/ro-crate.jsonld").read_text()
     )

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program that records as somebody would who gives away in every place who it is.
+"""A program whose recordings name their author in every place.
 
-It is copied into the home directory of that person and run there, with the directory
-of the recordings.
+Tests copy it into the author's home directory and run it there.
 """
 
 import sys

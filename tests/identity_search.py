@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for words in files, however they are packed there; with nothing of mjrec."""
+"""A search for words in files, archives and compressed data, without mjrec."""
 
 import gzip
 import io
@@ -14,19 +14,16 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def find(path, words):
-    """Return where below a file or directory which of the words are.
+    """Return the pairs of place and word in a file or directory.
 
-    Names of files count, and so do those inside of archives and HDF5 files.
+    Names of files count, also in archives and HDF5 files.
     """
-    needles = [
-        (word, {word.lower().encode(encoding) for encoding in _ENCODINGS})
-        for word in words
-    ]
+    forms = [(word, {word.lower().encode(e) for e in _ENCODINGS}) for word in words]
     return [
         (where, word)
         for where, content in _everything(path)
-        for word, forms in needles
-        if any(form in content.lower() for form in forms)
+        for word, encoded in forms
+        if any(form in content.lower() for form in encoded)
     ]
 
 
@@ -85,7 +82,7 @@ def _bytes(value):
 
 
 def _inside_png(where, content):
-    """Yield the texts in a frame that are compressed."""
+    """Yield the compressed texts of an image."""
     start = len(_PNG)
     while start < len(content):
         end = start + 12 + int.from_bytes(content[start : start + 4])

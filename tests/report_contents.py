@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of reports, made by hand."""
+"""Builders of report contents."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +13,9 @@ from mjrec.reporting.contents import ReportContents, ReportTask, ReportVideo, Ve
 
 _FEW = Bootstrap(resamples=50)
 
-# Markup, quotes, what ends a script, a comment and a template, a mark that turns the
-# direction of writing, line ends that JSON allows and JavaScript did not, a formula,
-# addresses, and a name that never ends.
+# Markup, quotes, ends of scripts and comments, a template, a mark that reverses
+# text, line ends that JSON allows and JavaScript did not, a formula,
+# addresses, and very long names.
 HOSTILE = (
     "<script>alert(1)</script>",
     "</script><script>alert(2)</script>",
@@ -33,10 +33,8 @@ HOSTILE = (
 )
 
 
-def task(
-    name, returns, *, seeds=1, failures=None, score_range=(0.0, 1000.0), **changes
-):
-    """Return a task of equally many episodes of each seed, or of monitors (`runs`)."""
+def task(name, returns, *, seeds=1, failures=None, score_range=(0.0, 1e3), **changes):
+    """Return a task with equally many episodes per seed, or per monitor (`runs`)."""
     count = len(returns)
     each = max(1, count // seeds)
     episodes = np.zeros(count, ROW)
@@ -73,7 +71,6 @@ def task(
 
 
 def video(index=0, **changes):
-    """Return a video, whose file need not be there."""
     made = ReportVideo(
         path=Path("evaluation/a b.mp4"),
         index=index,
@@ -91,7 +88,7 @@ def video(index=0, **changes):
 
 
 def contents(*tasks, **changes):
-    """Return a report of them, or of two tasks of five seeds."""
+    """Return a report of tasks, by default of two with five seeds each."""
     if not tasks:
         tasks = (
             task("dm_control/walker-walk", _returns(900, 40), seeds=5),
@@ -100,8 +97,8 @@ def contents(*tasks, **changes):
     returns = {t.name: t.episodes["total_reward"] for t in tasks}
     scales = dict.fromkeys(returns, (0.0, 1000.0))
     finite = all(np.isfinite(s).all() and len(s) for s in returns.values())
-    told = summarize_across(returns, scales, bootstrap=_FEW)
-    across = {"evaluation": told} if finite else {}
+    summary = summarize_across(returns, scales, bootstrap=_FEW)
+    across = {"evaluation": summary} if finite else {}
     made = ReportContents(
         title="An evaluation", tasks=list(tasks), across=across, bootstrap=_FEW
     )
@@ -109,7 +106,7 @@ def contents(*tasks, **changes):
 
 
 def hostile_report():
-    """Return contents in which every text is one that means harm."""
+    """Return contents whose texts are all hostile."""
     tasks = [
         task(
             text,

@@ -1,47 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings that reports are made of."""
+"""Builders of small recordings for reports."""
 
 from pathlib import Path
 
 import numpy as np
+import result_files
 
 import mjrec
-from mjrec.formats.journal import JournalEntry, JournalWriter
 
 GYM = Path(__file__).parent / "data" / "gym"
 
 
 def entry(episode_id, **values):
-    known = {
-        "episode_id": episode_id,
+    usual = {
         "length": 10,
-        "reward": float(episode_id),
-        "type": "t",
         "start_time": 1.79e9 + episode_id,
         "end_time": 1.79e9 + episode_id + 0.5,
         "seed": None,
-        "options": None,
         "terminated": False,
         "truncated": True,
-        "success": None,
     }
-    return JournalEntry(**{**known, **values})
+    return result_files.entry(episode_id, **{**usual, **values})
 
 
 def write_journal(directory, infix, env_id, entries):
-    """Write what a monitor that was killed leaves."""
+    """Write the journal of a killed monitor."""
     directory.mkdir(parents=True, exist_ok=True)
-    path = directory / f"openaigym.episodes.{infix}.jsonl"
-    info = {"gym_version": "mjrec-1", "env_id": env_id}
-    writer = JournalWriter(path, run={"env_info": info})
-    for each in entries:
-        writer.append(each)
-    writer.close()
-    return path
+    run = {"env_info": {"gym_version": "mjrec-1", "env_id": env_id}}
+    return result_files.write_journal(directory, infix, *entries, run=run)
 
 
 def record(env, directory, episodes, **options):
-    """Record episodes of a fixed action."""
     monitor = mjrec.Monitor(env, directory, **options)
     for seed in range(episodes):
         monitor.reset(seed=seed)

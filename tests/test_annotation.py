@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames say which moment of which episode they show."""
+"""Captions in frames."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ def plain(height, width, brightness=128):
 
 @pytest.mark.parametrize("size", [(64, 64), (480, 480)])
 @pytest.mark.parametrize("brightness", [0, 128, 255])
-def test_letters_stand_out(size, brightness):
-    """On light and on dark; most of the frame stays as it was."""
+def test_caption_contrasts_with_any_background(size, brightness):
+    """The lower half of the frame stays unchanged."""
     frame = plain(*size, brightness)
     result = annotated(frame, CAPTION)
     assert (result.shape, result.dtype) == (frame.shape, frame.dtype)
@@ -31,8 +31,7 @@ def test_letters_stand_out(size, brightness):
     "other",
     [{"episode_id": 28}, {"step": 121}, {"time": 2.45}, {"time": None}, {"reward": 1}],
 )
-def test_everything_is_said(other):
-    """Whatever of a caption is other, the frame is another one."""
+def test_caption_shows_every_value(other):
     frame = plain(240, 320)
     before = annotated(frame, CAPTION)
     assert (annotated(frame, replace(CAPTION, **other)) != before).any()
@@ -40,8 +39,8 @@ def test_everything_is_said(other):
 
 @pytest.mark.parametrize("height", [1, 2, 7, 16, 33])
 @pytest.mark.parametrize("width", [1, 7, 33, 700])
-def test_any_size_will_do(height, width):
-    """Down to one pixel, which has no room for letters."""
+def test_any_frame_size_works(height, width):
+    """One pixel has no room for letters."""
     long = Caption(episode_id=10**9, step=10**9, time=1e9, reward=float("nan"))
     result = annotated(plain(height, width), long)
     assert result.shape == (height, width, 3)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that name nobody, of somebody who is named in all of them."""
+"""Anonymous copies of recordings that name their author everywhere."""
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -17,36 +18,22 @@ import mujoco
 import numpy as np
 import pytest
 from identity_search import find
+from packed_runs import unpacked
 from PIL import Image, PngImagePlugin
+from recordings import hashes_at
 
 import mjrec
-from mjrec.evidence.anonymity import make_anonymous
+from mjrec.evidence.anonymity import anonymous_sources, make_anonymous
 from mjrec.evidence.identity import Identity
-from mjrec.evidence.identity_matching import remaining_identity
+from mjrec.evidence.identity_matching import IdentityMatcher, remaining_identity
 from mjrec.json_text import loads
 
+MBRUNELLI = Identity(users={"mbrunelli"})
+MATCHER = IdentityMatcher(MBRUNELLI)
 NAMES = ("mbrunelli", "Brunelli", "Margherita", "brunelli-ws7", "brunlab")
 WORDS = (*NAMES, "m.brunelli@uni-pavia.example", "secret-gait", "home/")
 
-# What is run as that person, with the directories and the authors.
-ANONYMOUS = """
-import sys, pathlib
-from mjrec.evidence.anonymity import make_anonymous
-from mjrec.evidence.identity_matching import remaining_identity
-from mjrec.evidence.identity import identity_of_user
-from mjrec.evidence.statements import state
-from mjrec.formats.manifest import read_manifest
-for directory in map(pathlib.Path, sys.argv[1:]):
-    manifests = map(read_manifest, directory.glob("*.manifest.json"))
-    provenance = [manifest.mjrec["provenance"] for manifest in manifests]
-    authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
-    stated = state(title=None, authors=authors, license=None)
-    identity = identity_of_user(provenance, stated.authors)
-    make_anonymous(directory, identity=identity)
-    for where, what in remaining_identity(directory, identity):
-        print(where, what)
-"""
-
+# Runs under the author's account.
 PACK = """
 import sys, mjrec
 authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
@@ -56,7 +43,7 @@ mjrec.pack(source, target, authors=authors, anonymous=how == "anonymous")
 
 
 def models_have_paths():
-    """Return whether compiled models have their files' directories; not in 3.3.0."""
+    """Return whether compiled models contain directories of files; not in 3.3.0."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.xml")
         texture = '<texture name="t" type="2d" file="t.png"/>'
@@ -69,8 +56,8 @@ def models_have_paths():
 MODELS_HAVE_PATHS = models_have_paths()
 
 
-class Somebody:
-    """A person with an account, a machine, a repository and a model."""
+class Author:
+    """An author with an account, a machine, a repository and a model."""
 
     def __init__(self, place):
         self.home = place / "home" / "mbrunelli"
@@ -89,10 +76,11 @@ class Somebody:
         ):
             self.call("git", *arguments)
         self.commit = self.call("git", "rev-parse", "HEAD").strip()
-        # On a machine of another name, if that may be.
+        # Under another host name, where the kernel permits one.
         naming = 'hostname brunelli-ws7 && exec "$@"'
         self.host = ["unshare", "--uts", "sh", "-c", naming, "sh"]
-        if not shutil.which("unshare") or not self.is_possible(*self.host, "true"):
+        tried = shutil.which("unshare") and subprocess.run([*self.host, "true"])
+        if not tried or tried.returncode:
             self.host = []
 
     def write_model(self):
@@ -105,17 +93,13 @@ class Somebody:
             f"<!-- as measured in {self.home} -->",
         )
         models, texts = self.work / "models", PngImagePlugin.PngInfo()
-        said = f"<!-- written by Margherita Brunelli -->\n{xml}"
-        (models / "robot.xml").write_text(said)
+        xml = f"<!-- written by Margherita Brunelli -->\n{xml}"
+        (models / "robot.xml").write_text(xml)
         texts.add_text("Author", "M. Brunelli", zip=True)
         Image.new("RGB", (4, 4), (90, 0, 0)).save(models / "logo.png", pnginfo=texts)
 
     def python(self, *arguments):
-        """Run Python with arguments, and return what it says."""
         return self.call(*self.host, sys.executable, *map(str, arguments))
-
-    def is_possible(self, *command):
-        return not subprocess.run(command, capture_output=True).returncode
 
     def call(self, *command):
         names = dict.fromkeys(("USER", "LOGNAME"), "mbrunelli")
@@ -126,22 +110,21 @@ class Somebody:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            check=False,
         )
         assert done.returncode == 0, done.stdout
         return done.stdout
 
 
 @pytest.fixture(scope="module")
-def somebody(tmp_path_factory):
-    return Somebody(tmp_path_factory.mktemp("disk"))
+def author(tmp_path_factory):
+    return Author(tmp_path_factory.mktemp("disk"))
 
 
 @pytest.fixture(scope="module")
-def recorded(somebody):
+def recorded(author):
     """Return a directory with a directory of each kind of recordings."""
-    somebody.python("identity_recording.py", "runs")
-    return somebody.work / "runs"
+    author.python("identity_recording.py", "runs")
+    return author.work / "runs"
 
 
 def contents(directory):
@@ -149,132 +132,106 @@ def contents(directory):
 
 
 @pytest.fixture(scope="module")
-def anonymous(somebody, recorded, tmp_path_factory):
-    """Copies of the recordings, as hard links, of which nobody says who made them."""
-    stage = tmp_path_factory.mktemp("stage")
-    for directory in recorded.iterdir():
-        shutil.copytree(directory, stage / directory.name, copy_function=os.link)
+def packed(author, recorded, tmp_path_factory):
+    """Return a directory of anonymous archives and one of named archives."""
     before = contents(recorded)
-    assert somebody.python("-c", ANONYMOUS, stage / "pendulum", stage / "diary") == ""
-    assert contents(recorded) == before
-    return stage
-
-
-@pytest.fixture(scope="module")
-def packed(somebody, recorded, tmp_path_factory):
-    """A directory of archives that name nobody, and one of archives that do."""
     directories = {how: tmp_path_factory.mktemp(how) for how in ("anonymous", "named")}
     for how, directory in directories.items():
         for kind in ("pendulum", "diary"):
             target = directory / f"{kind}.zip"
-            somebody.python("-c", PACK, recorded / kind, target, how)
+            author.python("-c", PACK, recorded / kind, target, how)
+    assert contents(recorded) == before
     return directories
 
 
+@pytest.fixture(scope="module")
+def anonymous(packed, tmp_path_factory):
+    """Return the pendulum's recordings in their anonymous archive."""
+    archive = packed["anonymous"] / "pendulum.zip"
+    return unpacked(archive, tmp_path_factory.mktemp("bag")) / "data" / "recordings"
+
+
 def trajectories(directory):
-    paths = sorted((directory / "pendulum").glob("*.h5"))
-    return [mjrec.load_trajectory(path) for path in paths]
+    return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
 
 
 def read(path):
     return loads(path.read_bytes())
 
 
-def test_nothing_of_the_identity_is_left(somebody, anonymous):
-    """No login, host, home, repository, address or author, in no form in no file."""
-    assert find(anonymous, [*WORDS, somebody.commit]) == []
-
-
-@pytest.mark.thorough
-def test_nothing_of_the_identity_is_packed(somebody, packed):
-    """Nor is it in what describes the recordings; and the lists fit the new names."""
-    assert find(packed["anonymous"], [*WORDS, somebody.commit]) == []
+def test_anonymous_archives_are_valid_and_contain_no_identity(author, packed):
+    assert find(packed["anonymous"], [*WORDS, author.commit]) == []
     for archive in packed["anonymous"].iterdir():
         assert mjrec.verify(archive, level="files").failures == ()
 
 
-PLACES = [
-    *(r"manifest\.json$", r"meta\.json$", r"\.jsonl$", r"\.h5 > /@facts"),
-    *(r"diary\.video\d+\.json$", r"monitor\.csv \(name\)$", r"\.mp4 \(name\)"),
-    *(r"model.*zip > source/robot\.xml$", r"model.*zip > source/logo\.png \(zTXt\)"),
-    *(r"stats\.json \(name\)", r"environment\.json$", r"ro-crate-metadata\.json$"),
-    *(r"CITATION\.cff$", r"README\.md$", r"statistics\.csv$"),
-    *([r"mjb\.gz \(unpacked\)"] if MODELS_HAVE_PATHS else []),
-]
-
-
-def test_the_search_finds_it_where_it_was(packed):
-    """In what was packed with names, the same search finds them in each place."""
+def test_search_finds_the_identity_in_each_place_of_named_archives(packed):
     found = [place for place, _ in find(packed["named"], WORDS)]
-    for where in PLACES:
+    for where in (
+        *(r"manifest\.json$", r"meta\.json$", r"\.jsonl$", r"\.h5 > /@facts"),
+        *(r"diary\.video\d+\.json$", r"monitor\.csv \(name\)$", r"\.mp4 \(name\)"),
+        r"model.*zip > source/robot\.xml$",
+        r"model.*zip > source/logo\.png \(zTXt\)",
+        *(r"stats\.json \(name\)", r"environment\.json$", r"ro-crate-metadata\.json$"),
+        *(r"CITATION\.cff$", r"README\.md$", r"statistics\.csv$"),
+        *[r"mjb\.gz \(unpacked\)"] * MODELS_HAVE_PATHS,
+    ):
         assert any(re.search(where, place) for place in found), where
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
-def test_the_search_and_the_gate_find_it_in_every_encoding(tmp_path, encoding):
-    """Both find a name amid bytes that are no text."""
+def test_search_and_gate_find_names_in_each_encoding(tmp_path, encoding):
+    """They find a name between bytes that are no text."""
     content = bytes(range(256)) + "MBrunelli".encode(encoding) + b"\xff\xfe"
     (tmp_path / "file").write_bytes(content)
-    identity = Identity(users={"mbrunelli"})
     assert find(tmp_path, ["mbrunelli"]) == [("file", "mbrunelli")]
-    assert remaining_identity(tmp_path, identity) == [("file", "MBrunelli")]
+    assert remaining_identity(tmp_path, MBRUNELLI) == [("file", "MBrunelli")]
 
 
-def test_the_gate_finds_it_in_each_kind_of_place(recorded):
-    """What looks last of all finds the identity wherever another search does."""
+def test_gate_finds_the_identity_in_each_kind_of_place(recorded):
     identity = Identity(users={"mbrunelli"}, people={"Margherita Brunelli"})
-    left = {where for where, _ in remaining_identity(recorded, identity)}
+    left = [where for where, _ in remaining_identity(recorded, identity)]
     endings = [r"manifest\.json", r"\.jsonl", r"\.csv", r"\.mp4", r"robot\.xml"]
-    for ending in [*endings, *(["unpacked"] if MODELS_HAVE_PATHS else [])]:
+    for ending in [*endings, "@facts.*", *["unpacked"] * MODELS_HAVE_PATHS]:
         assert any(re.search(f"{ending}$", where) for where in left), ending
-    assert any("@facts" in where for where in left)
 
 
-def test_all_is_readable_and_says_the_same(recorded, anonymous):
-    """Statistics, episodes, arrays, the model and the frames are as before."""
-    old, new = (mjrec.load_results(d / "pendulum") for d in (recorded, anonymous))
+def test_anonymous_recordings_have_equal_contents(recorded, anonymous):
+    """Statistics, episodes, arrays, models and frames are equal."""
+    directories = (recorded / "pendulum", anonymous)
+    old, new = map(mjrec.load_results, directories)
     assert new["episode_rewards"] == old["episode_rewards"]
     assert new["timestamps"] == old["timestamps"]
-    for directory in (recorded, anonymous):
-        episodes = mjrec.iter_episodes(directory / "pendulum")
+    for directory in directories:
+        episodes = mjrec.iter_episodes(directory)
         assert [episode.length for episode in episodes] == [4, 4]
-    pairs = zip(trajectories(recorded), trajectories(anonymous), strict=True)
-    for before, after in pairs:
+    for before, after in zip(*map(trajectories, directories), strict=True):
         for name in ("states", "actions", "rewards", "terminated", "frame_steps"):
             np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
         np.testing.assert_equal(after.snapshots, before.snapshots)
-    # From sources without comments, and without the compiled one if it had a path.
-    assert any((anonymous / "pendulum").glob("*.mjb.gz")) != MODELS_HAVE_PATHS
+    # The compiled model stays unless it contains a path.
+    assert any(anonymous.glob("*.mjb.gz")) != MODELS_HAVE_PATHS
+    old, new = before.model(), after.model()
     for name in ("qpos0", "geom_size", "body_mass", "tex_data", "names"):
-        one, other = getattr(before.model(), name), getattr(after.model(), name)
-        np.testing.assert_array_equal(one, other)
-    [hashes] = (anonymous / "pendulum").glob("*.video000001.framehash")
-    again = [hashlib.sha256(frame).hexdigest() for frame in mjrec.render(after)]
-    lines = hashes.read_text().splitlines()
-    assert again == [line.split()[-1] for line in lines if not line.startswith("#")]
+        np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
+    [hashes] = anonymous.glob("*.video000001.framehash")
+    rendered = [hashlib.sha256(frame).hexdigest() for frame in mjrec.render(after)]
+    assert rendered == hashes_at(hashes)
 
 
-def test_files_are_renamed_and_so_is_what_refers_to_them(anonymous):
-    """The uid with the name in it is another one, in every file."""
-    directory = anonymous / "pendulum"
-    manifest = read(directory / "openaigym.manifest.0.user-final.manifest.json")
+def test_names_become_placeholders_in_files_and_references(anonymous):
+    manifest = read(anonymous / "openaigym.manifest.0.user-final.manifest.json")
     assert manifest["stats"] == "openaigym.episode_batch.0.user-final.stats.json"
     for names in manifest["videos"]:
-        assert all((directory / name).is_file() for name in names)
-    assert {t.facts["infix"] for t in trajectories(anonymous)} == {"0.user-final"}
-    metadata = read(directory / manifest["videos"][0][1])
+        assert all((anonymous / name).is_file() for name in names)
+    metadata = read(anonymous / manifest["videos"][0][1])
     assert metadata["also_named"] == "user-run-episode-0.mp4"
-    assert (directory / "user-run-episode-0.mp4").is_file()
     assert metadata["encoder_version"]["cmdline"][-1] == manifest["videos"][0][0]
-
-
-def test_placeholders_stand_for_what_was_there(anonymous):
-    """Options, arguments and reasons keep what names nobody."""
-    [trajectory, _] = trajectories(anonymous)
-    assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
-    kwargs = trajectory.facts["environment"]["kwargs"]
-    assert kwargs["xml_file"] == "<path>/models/robot.xml"
-    details = read(next((anonymous / "pendulum").glob("*.manifest.json")))["mjrec"]
+    facts, other = (trajectory.facts for trajectory in trajectories(anonymous))
+    assert facts["infix"] == other["infix"] == "0.user-final"
+    assert facts["options"] == {"goal": "<path>/goal.npy"}
+    assert facts["environment"]["kwargs"]["xml_file"] == "<path>/models/robot.xml"
+    details = manifest["mjrec"]
     assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]
     provenance, python = details["provenance"], Path(sys.executable).name
     assert provenance["command"] == [python, "identity_recording.py", "runs"]
@@ -282,18 +239,54 @@ def test_placeholders_stand_for_what_was_there(anonymous):
     assert provenance["policy"]["file"] == "policy.pt"
 
 
-def test_the_same_recordings_become_the_same_files(
-    somebody, recorded, tmp_path, packed
-):
-    """However often, and whatever else was in the files' directory."""
-    again = tmp_path / "pendulum.zip"
-    somebody.python("-c", PACK, recorded / "pendulum", again, "anonymous")
-    first = packed["anonymous"] / "pendulum.zip"
-    assert again.read_bytes() == first.read_bytes()
+def test_anonymous_archives_are_reproducible(author, recorded, tmp_path, packed):
+    archive = tmp_path / "pendulum.zip"
+    author.python("-c", PACK, recorded / "pendulum", archive, "anonymous")
+    earlier = packed["anonymous"] / archive.name
+    assert archive.read_bytes() == earlier.read_bytes()
 
 
-def test_two_uids_do_not_become_one(tmp_path):
-    """Of two that differ in what is taken out, one gets a number."""
+def zipped(**members):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        # Text that only looks like a comment stays.
+        (b'<m><!-- mine -->\n<a b="&lt;!--"/></m>', b'<m>\n<a b="&lt;!--"/></m>'),
+        (b"<m><![CDATA[<!-- a -->]]></m>", b"<m><![CDATA[<!-- a -->]]></m>"),
+        # Licenses stay unless they name the author or give an address.
+        (b"<!-- Copyright 2020 The Robots --><m/>",) * 2,
+        (b"<!-- Copyright mbrunelli --><m/>", b"<m/>"),
+        (b"<!-- (c) me@lab.example --><m/>", b"<m/>"),
+        # Names of elements are part of the model.
+        (b'<m model="mbrunelli"><body name="mbrunelli"/></m>',) * 2,
+    ],
+)
+def test_comments_of_models_are_removed_except_licenses(before, after):
+    sources = anonymous_sources(zipped(file=before), MATCHER)
+    with zipfile.ZipFile(io.BytesIO(sources)) as archive:
+        assert archive.read("file") == after
+
+
+def test_sources_without_names_are_returned_unchanged():
+    content = zipped(a=b"<mujoco/>", b=b"{}")
+    assert anonymous_sources(content, MATCHER) is content
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4 torn", zipped(a=b"<mujoco><!--")])
+def test_damaged_sources_are_rejected(content):
+    with pytest.raises(ValueError, match=r"damaged|not valid XML"):
+        anonymous_sources(content, MATCHER)
+
+
+def test_distinct_uids_stay_distinct(tmp_path):
+    """A number separates uids that differ only in a removed name."""
     name = "openaigym.episodes.0.{}.jsonl"
     for uid in ("mbrunelli", "lovelace", "user"):
         (tmp_path / name.format(uid)).write_text(f'{{"by": "{uid}"}}\n')
@@ -302,8 +295,8 @@ def test_two_uids_do_not_become_one(tmp_path):
     assert left == {name.format(uid) for uid in ("user", "user-2", "user-3")}
 
 
-def test_commands_and_cards_name_nobody(tmp_path):
-    """Names of environments stay, which device drew, and how many GPUs were given."""
+def test_commands_and_gpu_ids_become_placeholders(tmp_path):
+    """Environment names, device indices and numbers of GPUs stay."""
     card = "GPU-8f1c2b0e-5d6a-4e3b-9c7d-112233445566"
     command = ["mjrec", "record", "dm_control/cartpole-balance", "/opt/lab/policy.pt"]
     variables = {"CUDA_VISIBLE_DEVICES": f"{card},GPU-8f,2"}
@@ -312,14 +305,15 @@ def test_commands_and_cards_name_nobody(tmp_path):
     path = tmp_path / "openaigym.video.0.1.video000000.meta.json"
     path.write_text(json.dumps({"gl_device": device, "provenance": provenance}))
     make_anonymous(tmp_path, identity=Identity())
-    said = read(path)
-    assert said["gl_device"] == {"index": 1}
-    assert said["provenance"]["command"] == [*command[:3], "policy.pt"]
-    assert said["provenance"]["variables"] == {"CUDA_VISIBLE_DEVICES": "<gpu>,<gpu>,2"}
+    metadata = read(path)
+    assert metadata["gl_device"] == {"index": 1}
+    provenance = metadata["provenance"]
+    assert provenance["command"] == [*command[:3], "policy.pt"]
+    assert provenance["variables"] == {"CUDA_VISIBLE_DEVICES": "<gpu>,<gpu>,2"}
 
 
-def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path):
-    """The header of the one is JSON; of the other, what is no JSON is left out."""
+def test_csv_headers_and_torn_journals_lose_names(tmp_path):
+    """The torn line of the journal is dropped."""
     csv = tmp_path / "openaigym.results.0.7.monitor.csv"
     table = '#{"t_start": 1.5, "env_id": "/home/ada/a.xml"}\nr,l,t\n1.0,2,0.5\n'
     csv.write_text(table)
@@ -330,28 +324,23 @@ def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path):
     assert journal.read_text() == '{"reward": 1e999, "seed": null}\n'
 
 
-def test_films_are_searched_across_the_pieces_that_are_read(tmp_path):
-    """They are too large to be read at once, and a name may lie where one ends."""
+def test_gate_finds_a_name_across_two_reads(tmp_path):
     begin = b"\0\0\0\x18ftyp"
     filling = b"\xff" * ((1 << 24) - len(begin) - 4)
     (tmp_path / "film").write_bytes(begin + filling + b"mbrunelli")
-    identity = Identity(users={"mbrunelli"})
-    assert remaining_identity(tmp_path, identity) == [("film", "mbrunelli")]
+    assert remaining_identity(tmp_path, MBRUNELLI) == [("film", "mbrunelli")]
 
 
-def test_what_cannot_be_unpacked_is_an_error_of_the_gate(tmp_path):
-    """Nobody knows what is in it."""
+def test_gate_rejects_damaged_compression(tmp_path):
     (tmp_path / "file").write_bytes(b"\x1f\x8b torn")
     with pytest.raises(mjrec.UnreadableFile, match="cannot be unpacked"):
         remaining_identity(tmp_path, Identity())
 
 
-def test_bodies_that_name_somebody_are_found_by_the_gate(tmp_path):
-    """What cannot be taken out of a model is said, with the place."""
+def test_gate_finds_names_of_bodies_in_models(tmp_path):
     model = tmp_path / "openaigym.model.0123456789abcdef.zip"
-    with zipfile.ZipFile(model, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("source/a.xml", '<mujoco><body name="mbrunelli"/></mujoco>')
-    identity = Identity(users={"mbrunelli"})
-    make_anonymous(tmp_path, identity=identity)
+    source = b'<mujoco><body name="mbrunelli"/></mujoco>'
+    model.write_bytes(zipped(**{"source/a.xml": source}))
+    make_anonymous(tmp_path, identity=MBRUNELLI)
     place = f"{model.name}: source/a.xml"
-    assert remaining_identity(tmp_path, identity) == [(place, "mbrunelli")]
+    assert remaining_identity(tmp_path, MBRUNELLI) == [(place, "mbrunelli")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An archive is reproducible, and is written whole or not at all."""
+"""Archives of videos: reproducible, and written whole or not at all."""
 
 import gzip
 import io
@@ -15,7 +15,6 @@ from mjrec.formats.archive import MAX_VIDEOS, write_archive
 
 
 def make(directory, name, suffix=".mp4"):
-    """Make a video and its metadata, with a content each."""
     video, metadata = directory / f"{name}{suffix}", directory / f"{name}.meta.json"
     video.write_bytes(b"video " + name.encode())
     metadata.write_bytes(b"metadata " + name.encode())
@@ -23,7 +22,7 @@ def make(directory, name, suffix=".mp4"):
 
 
 def refusal(videos):
-    """Return the message with which `videos` are refused, with nothing written."""
+    """Return the error for `videos`, after which the archive is empty."""
     archive = io.BytesIO()
     with pytest.raises(ArchiveError, match=r"^\[Hopper-v5\] ") as caught:
         write_archive(videos, archive, env_id="Hopper-v5")
@@ -31,12 +30,12 @@ def refusal(videos):
     return str(caught.value).removeprefix("[Hopper-v5] ")
 
 
-def test_it_holds_the_files_and_then_their_list(tmp_path):
-    """A tar.gz of the pairs as given; nothing says anything of the machine."""
+def test_archive_contains_files_then_their_list(tmp_path):
+    """It contains nothing about the machine."""
     first, second = make(tmp_path, "b"), make(tmp_path, "a", ".json")
     archive = io.BytesIO()
     archive.write(b"before")
-    # As `load_results` gives them, too.
+    # `load_results` returns strings.
     write_archive([first, tuple(map(str, second))], archive)
     archive.seek(len(b"before"))
     contents = {}
@@ -52,9 +51,8 @@ def test_it_holds_the_files_and_then_their_list(tmp_path):
     assert json.loads(contents["manifest.json"]) == {"version": 0, "videos": videos}
 
 
-def test_the_same_videos_give_the_same_bytes(tmp_path):
-    """Whatever their times, permissions, directory and the archive's own name."""
-    archives = []
+def test_equal_videos_give_equal_archives(tmp_path):
+    """Times, modes, directory and archive name make no difference."""
     for name, mode in (("first", 0o600), ("second", 0o755)):
         (tmp_path / name).mkdir()
         pair = make(tmp_path / name, "a")
@@ -62,14 +60,13 @@ def test_the_same_videos_give_the_same_bytes(tmp_path):
         os.utime(pair[0], (mode, mode))
         with (tmp_path / f"{name}.tar.gz").open("wb") as archive:
             write_archive([pair], archive)
-        archives.append((tmp_path / f"{name}.tar.gz").read_bytes())
-    assert archives[0] == archives[1]
-    assert archives[0][4:8] == bytes(4), "gzip's header has a time"
-    assert b"first" not in gzip.decompress(archives[0])
+    first, second = (path.read_bytes() for path in tmp_path.glob("*.tar.gz"))
+    assert first == second
+    assert first[4:8] == bytes(4), "gzip's header has a time"
+    assert b"first" not in gzip.decompress(first)
 
 
-def test_a_hundred_videos_fit_and_no_more(tmp_path):
-    """The message has the numbers the right way round, and comes first of all."""
+def test_archive_holds_at_most_100_videos(tmp_path):
     pairs = [make(tmp_path, f"v{index}") for index in range(MAX_VIDEOS)]
     write_archive(pairs, io.BytesIO())
     missing = (tmp_path / "missing.mp4", tmp_path / "missing.meta.json")
@@ -87,7 +84,7 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path):
         (["a.mp4 a.json"], "'a.json' is not a metadata file name"),
         (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
         (["Manifest.json"], "the archive's manifest"),
-        # In gym's order: pair by pair, and in each presence, doubles, names.
+        # In gym's order: of each pair first presence, then duplicates, then names.
         (["a.mp4 -"], "the metadata of the video"),
         (["b+c.mp4", "-"], "not a video name"),
         (["-", "b+c.mp4"], "The video "),
@@ -96,8 +93,8 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path):
         (["b.meta.json b.meta.json"], "'b.meta.json' occurs twice"),
     ],
 )
-def test_names_differ_are_plain_and_say_what_they_are(tmp_path, names, reason):
-    """ASCII letters, digits and three signs; nothing after the ending."""
+def test_names_must_be_plain_distinct_and_of_known_types(tmp_path, names, reason):
+    """ASCII letters, digits and three signs, with nothing after the ending."""
     (tmp_path / "other").mkdir()
     pairs = []
     for each in names:
@@ -119,8 +116,7 @@ def test_names_differ_are_plain_and_say_what_they_are(tmp_path, names, reason):
     ],
 )
 @pytest.mark.parametrize("name", ["x.mp4", "x.meta.json"])
-def test_only_regular_files_go_in(tmp_path, put, name):
-    """No directory, no link, whole or broken, and no pipe, on either place."""
+def test_only_regular_files_are_accepted(tmp_path, put, name):
     video, metadata = make(tmp_path, "a")
     put(tmp_path / name)
     pair = (tmp_path / name, metadata) if "mp4" in name else (video, tmp_path / name)

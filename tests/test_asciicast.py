@@ -13,7 +13,7 @@ from mjrec.formats.asciicast import AsciicastWriter
 
 
 def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path):
-    """An accent is one column wide and a colour none; the real player plays it."""
+    """An accent has one column and a color none, and the real player plays it."""
     path = tmp_path / "a.json"
     writer = AsciicastWriter(path, rate=Fraction(4))
     writer.write("éé\n\x1b[41mx\x1b[0m\n")
@@ -33,8 +33,7 @@ def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path):
     assert "world" in done.stdout
 
 
-def test_without_frames_or_given_up_there_is_no_file(tmp_path):
-    """A full disk is an error that names the file."""
+def test_empty_or_failed_casts_leave_no_file(tmp_path):
     AsciicastWriter(tmp_path / "a.json", rate=Fraction(1)).close()
     writer = AsciicastWriter(tmp_path / "a.json", rate=Fraction(1))
     with file_size_limit(10), pytest.raises(FileNotWritten, match=r"a\.json"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos that show nothing say so."""
+"""Detection of blank videos."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ from mjrec.blank_frames import BlankFrames
 
 
 def frame(value=0, *, pixel=None):
-    """Return a plain frame, with one pixel of another brightness if given."""
+    """Return a frame of one gray, and optionally one other pixel."""
     frame = np.full((40, 56, 3), value, np.uint8)
-    # Not one that a coarse look would see.
+    # A coarse grid would miss this pixel.
     frame[17, 21] = value if pixel is None else pixel
     return frame
 
@@ -33,8 +33,8 @@ CONSTANT = {"suspect_constant": True}
         ([frame()] * 9 + [frame(pixel=255)], {}),
     ],
 )
-def test_what_is_suspect(frames, facts):
-    """Black, of one colour each, or without movement; one pixel is enough."""
+def test_black_constant_or_still_videos_are_suspect(frames, facts):
+    """One differing pixel is enough."""
     blank = BlankFrames()
     for each in frames:
         blank.add(each)

@@ -31,8 +31,8 @@ FRONT_AND_SIDE = '<camera name="front"/><camera/><camera name="side"/>'
     ("camera", "number", "label"),
     [("side", 2, "side"), (0, 0, "front"), (np.int64(1), 1, 1)],
 )
-def test_a_camera_by_name_or_number(camera, number, label):
-    """Of MuJoCo's model or dm_control's; it is called by its name, else its number."""
+def test_camera_is_found_by_name_or_number(camera, number, label):
+    """Its label is its name, or its number without one."""
     model = model_with(FRONT_AND_SIDE)
     assert camera_names(model) == ["front", "side"]
     for given in (model, types.SimpleNamespace(ptr=model)):
@@ -44,8 +44,7 @@ def test_a_camera_by_name_or_number(camera, number, label):
         raw_model(mujoco.MjData(model))
 
 
-def test_a_free_camera():
-    """-1 is where the model puts it; an `MjvCamera` is its owner's to move."""
+def test_free_camera_is_the_models_default_or_the_given_object():
     model = model_with()
     expected = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, expected)
@@ -55,7 +54,7 @@ def test_a_free_camera():
     assert camera.distance == expected.distance
     assert resolve_camera(model, camera) is camera
     assert camera_label(model, -1) == -1
-    # So that a pose from metadata can be given as a camera.
+    # A pose from metadata is a camera too.
     label = camera_label(model, camera)
     assert camera_label(model, resolve_camera(model, label)) == label
     with pytest.raises(InvalidArgument, match="zoom"):
@@ -65,19 +64,18 @@ def test_a_free_camera():
 
 
 @pytest.mark.parametrize(
-    ("camera", "said"),
+    ("camera", "message"),
     [
         ("frnt", r"front, side\..*-1"),
-        # An empty name is not the nameless camera, and True not camera 1.
+        # An empty name is not the unnamed camera, and True is not camera 1.
         ("", r"front, side\..*-1"),
         (-2, r"number -2\b.* from -1 .* to 2"),
         (3, r"number 3\b.* from -1 .* to 2"),
         *((other, "must be a name, a number or") for other in (True, 0.0, None)),
     ],
 )
-def test_an_unknown_camera_names_those_there_are(camera, said):
-    """One clear error each."""
-    with pytest.raises(InvalidArgument, match=said) as caught:
+def test_unknown_cameras_are_errors_with_the_known(camera, message):
+    with pytest.raises(InvalidArgument, match=message) as caught:
         resolve_camera(model_with(FRONT_AND_SIDE), camera)
     if isinstance(caught.value, UnknownName):
         assert caught.value.available == ["front", "side"]
@@ -97,18 +95,17 @@ ARM = """
 @pytest.mark.parametrize(
     ("cameras", "inside", "found"),
     [
-        # A fixed camera on a robot moves with it but does not follow it.
+        # A fixed camera on a robot moves with it, and does not track it.
         (FRONT_AND_SIDE, '<camera name="eye"/>', None),
         (FRONT_AND_SIDE, ROBOT + '<camera name="a" mode="trackcom"/>', "robot"),
-        # The robot comes before a part, which is all that some models have.
+        # A camera of the robot comes before one of a part.
         ("", PART, "trunk"),
         ("", PART + ROBOT, "robot"),
-        # The hand of a fixed arm, as of dm_control's reacher, would be a close-up.
+        # The hand of a fixed arm, as in dm_control's reacher, would be a close-up.
         (ARM, "", None),
         (ARM, PART, "trunk"),
         (FRONT_AND_SIDE, '<camera mode="trackcom"/>', 3),
     ],
 )
-def test_the_camera_that_follows_the_robot(cameras, inside, found):
-    """By name, or by number where it has none."""
+def test_tracking_camera_follows_the_robot(cameras, inside, found):
     assert tracking_camera(model_with(cameras, inside)) == found

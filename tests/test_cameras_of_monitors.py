@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several cameras, captions and second names, through `mjrec.Monitor`."""
+"""Monitors with several cameras or with captions."""
 
 import json
 import sys
@@ -14,13 +14,13 @@ from mjrec.annotation import check_annotation
 
 SIZE = {"height": 48, "width": 64}
 
-# Of which several can be drawn live: those of `physics.render()`.
+# `physics.render()` can draw several cameras live.
 WAYS = ["deferred", pytest.param("live", marks=pytest.mark.dm_control)]
 CAMERAS = {"deferred": ["track", -1], "live": ["side", "back"]}
 
 
 def record(directory, steps=3, render="deferred", **options):
-    """Record an episode; return the frame hashes of each video, by its name's end."""
+    """Record an episode; return each video's frame hashes by its name's end."""
     if render == "live":
         from dm_control import suite
 
@@ -42,10 +42,10 @@ def metadata_of(video):
     return json.loads(video.with_suffix(".meta.json").read_text())
 
 
-# Takes more than five seconds: several monitors with workers of their own.
+# Takes more than five seconds: three monitors start workers.
 @pytest.mark.parametrize("render", WAYS)
-def test_several_cameras(tmp_path, render):
-    """Each has the video that it would have alone; side by side they are one."""
+def test_each_camera_has_its_own_video_or_they_are_tiled(tmp_path, render):
+    """Each video equals that of a monitor with that camera alone."""
     first, second = CAMERAS[render]
     several = {"camera": [first, second], "render": render}
     both = record(tmp_path / "both", **several)
@@ -54,9 +54,8 @@ def test_several_cameras(tmp_path, render):
     other = record(tmp_path / "second", camera=second, render=render)
     assert other == {"": both[f".{second}"]}
     videos = sorted((tmp_path / "both").glob("*.mp4"), key=lambda p: len(p.name))
-    assert {v for v, _ in manifest_of(tmp_path / "both")["videos"]} == {
-        path.name for path in videos
-    }
+    listed = {name for name, _ in manifest_of(tmp_path / "both")["videos"]}
+    assert listed == {path.name for path in videos}
     assert metadata_of(videos[0])["camera"] == first != metadata_of(videos[1])["camera"]
     record(tmp_path / "tiled", tiled=True, **several)
     [video] = (tmp_path / "tiled").glob("*.mp4")
@@ -68,8 +67,7 @@ def test_several_cameras(tmp_path, render):
         assert difference.mean() < 4
 
 
-def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path, monkeypatch):
-    """It says how to install it, and nothing is left."""
+def test_captions_without_pillow_are_an_error(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     check_annotation.cache_clear()
     with pytest.raises(mjrec.MissingDependency, match=r"install 'mjrec\[annotate\]'"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a child and its parent send each other arrives, whatever is printed."""
+"""Messages between a child process and its parent."""
 
 import subprocess
 import sys
@@ -13,21 +13,20 @@ for stream in map(int, sys.argv[2]):
     os.close(stream)
 with Child("mjrec.provenance", environ=os.environ) as child:
     child.send(places=[])
-    said = [*child.messages(60)]
-    found = f"{said} {child.how_it_ended()} {child.printed()}"
+    messages = [*child.messages(60)]
+    found = f"{messages} {child.how_it_ended()} {child.printed()}"
 pathlib.Path(sys.argv[1]).write_text(found)
 """
-# As some machines' `sitecustomize` prints.
+# Some machines' `sitecustomize` prints.
 HELLO = "import os\nfor stream in (1, 2):\n    os.write(stream, b'hello ')\n"
 
 
 @pytest.mark.parametrize(
     ("closed", "customized", "printed"), [("012", "", ""), ("", HELLO, "hello hello")]
 )
-def test_messages_arrive(closed, customized, printed, tmp_path):
-    """Where the parent has no standard streams, and where a child prints early."""
+def test_messages_arrive_despite_other_output(closed, customized, printed, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(customized)
     command = [sys.executable, "-c", PROGRAM, tmp_path / "outcome", closed]
     subprocess.run(command, check=True, env={"PYTHONPATH": str(tmp_path)})
-    said = (tmp_path / "outcome").read_text()
-    assert said == f"[{{}}] ended with status 0 {printed}"
+    outcome = (tmp_path / "outcome").read_text()
+    assert outcome == f"[{{}}] ended with status 0 {printed}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos counted in steps, drawn live or later: `step_trigger`, `video_length`."""
+"""Clips: videos counted in steps, drawn live or later."""
 
 import copy
 import json
@@ -24,7 +24,7 @@ from mjrec.rendering.recordings import recordings
 
 
 class Blinking(gymnasium.Wrapper):
-    """Shows another colour after every step and every reset."""
+    """Shows another color after every step and reset."""
 
     def reset(self, **options):
         self._blink(0.5)
@@ -35,28 +35,24 @@ class Blinking(gymnasium.Wrapper):
         return self.env.step(action)
 
     def _blink(self, more):
-        colour = self.env.unwrapped.model.geom_rgba
-        colour[:, 0] = (colour[:, 0] + more) % 1
+        color = self.env.unwrapped.model.geom_rgba
+        color[:, 0] = (color[:, 0] + more) % 1
 
 
-def hopper(length=5, **made):
-    """Return a hopper whose episodes are short, and small frames of it."""
-    # So wide that a caption has room.
-    size = {"width": 256, "height": 48}
-    return Blinking(
-        gymnasium.make("Hopper-v5", max_episode_steps=length, **size, **made)
-    )
+def hopper(length=5, **options):
+    # A caption needs this width.
+    options |= {"max_episode_steps": length, "width": 256, "height": 48}
+    return Blinking(gymnasium.make("Hopper-v5", **options))
 
 
 def reacher():
-    """Return a task whose resets put another target into the model."""
+    """Return a task that moves its target in the model at each reset."""
     from dm_control import suite
 
     return suite.load("reacher", "easy", {"random": 3, "time_limit": 0.08})
 
 
 def hop(env, steps):
-    """Take so many steps, with resets where they are needed."""
     done = True
     for number in range(steps):
         if done:
@@ -66,26 +62,25 @@ def hop(env, steps):
 
 
 def reach(env, steps):
-    """Take so many steps; a step after the last one of an episode is a reset."""
+    """Take steps; after the last step of an episode, `step` resets."""
     env.reset()
     for number in range(steps):
         env.step(np.full(2, 0.1 * (number % 7)))
 
 
-# One that begins with the second step.
+# It begins with the second step.
 CLIP = {"step_trigger": lambda step: step == 1, "workers": 0}
 CLIPS = {"step_trigger": lambda step: step in (2, 20), "video_length": 13}
 
 
 def record(directory, env, steps, **options):
-    """Record so many steps of an environment, and all videos of them."""
     ride = hop if isinstance(env, gymnasium.Env) else reach
     with mjrec.Monitor(env, directory, **{"workers": 1, **options}) as monitor:
         ride(monitor, steps)
 
 
 def hashes(directory):
-    """Return the hashes of the frames of each video, by the end of its name."""
+    """Return the frame hashes of each video, by the end of its name."""
     return {
         path.name.partition(".video")[2].split(".video")[-1]: hashes_at(path)
         for path in sorted(directory.glob("*.framehash"))
@@ -93,7 +88,6 @@ def hashes(directory):
 
 
 def metadata_in(directory):
-    """Return the metadata of each video."""
     paths = sorted(directory.glob("openaigym.*.meta.json"))
     return [json.loads(path.read_text()) for path in paths]
 
@@ -119,20 +113,20 @@ EVERY = {"video_callable": lambda _: True}
     ],
     default=2,
 )
-def test_frames_are_those_that_were_drawn_live(make, steps, options, tmp_path):
-    """Byte for byte, across resets that change or compile the model."""
-    said = []
+def test_deferred_frames_equal_live_frames(make, steps, options, tmp_path):
+    """Also across resets that change or compile the model."""
+    metadata = []
     for render in ("live", "deferred"):
         env = make(render_mode="rgb_array") if make is hopper else make()
         options = {**options, "workers": 1, "render": render}
         record(tmp_path / render, env, steps, **options)
-        said.append(metadata_in(tmp_path / render))
+        metadata.append(metadata_in(tmp_path / render))
     assert hashes(tmp_path / "live")
     assert hashes(tmp_path / "live") == hashes(tmp_path / "deferred")
     assert not in_flight(tmp_path / "deferred")
     same = "episode_id first_step last_episode_id length reward complete reason"
     same += " fps timestep stride frame_count frame_steps seed type height width camera"
-    for live, deferred in zip(*said, strict=True):
+    for live, deferred in zip(*metadata, strict=True):
         assert (live["recording"], deferred["recording"]) == ("live", "deferred")
         for key in same.split():
             assert live.get(key) == deferred.get(key), key
@@ -141,20 +135,16 @@ def test_frames_are_those_that_were_drawn_live(make, steps, options, tmp_path):
 @parametrize(
     ("options", "part", "frames", "fps"),
     [
-        # Two steps, a reset and three steps, a reset and a step, and the first frame.
+        # The first frame, six steps and two resets.
         ({"camera": ["track", -1]}, "step", 9, "125"),
-        # The rate is that of the file, whichever frames `max_fps` leaves.
+        # `max_fps` drops frames, and `fps` sets the rate of the file.
         ({"fps": 12, "max_fps": 62.5}, "step", 5, "12"),
-        # One that begins with an episode has its name.
-        (
-            {"step_trigger": None, "video_callable": lambda episode: episode == 1},
-            *("episode", 7, "125"),
-        ),
+        # A video that begins with an episode has its number.
+        ({"step_trigger": None, "video_callable": (1).__eq__}, "episode", 7, "125"),
     ],
     default=2,
 )
-def test_clips_wait_to_be_rendered(options, part, frames, fps, tmp_path):
-    """Pending, with a log for each episode; afterwards there is the video alone."""
+def test_deferred_clips_wait_until_rendered(options, part, frames, fps, tmp_path):
     steps = {**CLIP, "video_length": 6, "name_prefix": "rl-video"}
     record(tmp_path, hopper(3), 8, **{**steps, **options})
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
@@ -175,9 +165,8 @@ def test_clips_wait_to_be_rendered(options, part, frames, fps, tmp_path):
     assert not list(finish(tmp_path, workers=1))
 
 
-# Takes more than five seconds: a process is killed, and its clips are drawn.
-def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path):
-    """With all that was there; and it is in the manifest then."""
+# Takes more than five seconds: it kills a process and renders its clips.
+def test_clip_of_a_killed_process_is_rendered_whole(tmp_path):
     script = (
         "import os, sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
@@ -206,8 +195,8 @@ def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_clip_ends_where_its_frames_would_lie(tmp_path, caplog):
-    """What was taken before stays, and the next clip is another one."""
+def test_clip_ends_early_where_the_model_is_replaced(tmp_path, caplog):
+    """Earlier frames stay, and the next clip is another one."""
     env = hopper()
     options = {**CLIP, "workers": 1, "video_length": 4, "mode": "evaluation"}
     with mjrec.Monitor(env, tmp_path, **options) as monitor:
@@ -223,8 +212,8 @@ def test_a_clip_ends_where_its_frames_would_lie(tmp_path, caplog):
     assert (len(details["broken"]), details["pending"]) == (1, [])
 
 
-def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
-    """With `on_error="warn"`: what had room is rendered, and the manifest tells."""
+def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
+    """The frames before it are rendered."""
     options = {**CLIP, "video_length": 9, "on_error": "warn"}
     with mjrec.Monitor(hopper(), tmp_path, **options) as monitor:
         hop(monitor, 5)
@@ -243,14 +232,11 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
 @pytest.mark.parametrize(
     "name",
     [
-        "../there.mp4",
-        "openaigym.video.9.9.video000000.mp4",
+        *("", "../there.mp4", "openaigym.video.9.9.video000000.mp4"),
         "openaigym.video.{infix}.video000000.step000002.mp4",
-        "",
     ],
 )
-def test_no_other_video_is_written_over(name, tmp_path):
-    """Logs may be anybody's: the name of a video has to be that of its own clip."""
+def test_hostile_clip_names_overwrite_nothing(name, tmp_path):
     record(tmp_path, hopper(), 3, **CLIP)
     [key] = recordings(tmp_path)
     [log] = in_flight(tmp_path)
@@ -264,7 +250,7 @@ def test_no_other_video_is_written_over(name, tmp_path):
 
 
 class Counting(Corridor):
-    """Shows how many steps were taken so far, as the brightness of its frames."""
+    """Shows the number of steps taken as the brightness of its frames."""
 
     taken = 0
 
@@ -277,29 +263,25 @@ class Counting(Corridor):
 
 
 def begins(*at, **options):
-    """Return the options to begin at these steps."""
     return {"step_trigger": lambda step: step in at, **options}
 
 
 @pytest.mark.parametrize(
     ("length", "steps", "options", "shown"),
     [
-        # The frame before the step that began it, and no more than asked for.
+        # It begins with the frame before its first step.
         (
             *(100, 20, begins(0, 7, video_length=4)),
             {"0.step000000": [0, 1, 2, 3, 4], "0.step000007": [7, 8, 9, 10, 11]},
         ),
-        # None begins while another runs.
+        # None begins during another.
         (
             *(100, 8, begins(*range(0, 9, 2), video_length=3)),
             {"0.step000000": [0, 1, 2, 3], "0.step000004": [4, 5, 6, 7]},
         ),
         # Across resets: steps 3 and 6 end an episode.
-        (
-            *(3, 12, begins(2, video_length=5)),
-            {"0.step000002": [2, 3, 3, 4, 5, 6, 6, 7]},
-        ),
-        # At close it is shorter.
+        (3, 12, begins(2, video_length=5), {"0.step000002": [2, 3, 3, 4, 5, 6, 6, 7]}),
+        # Close ends it early.
         (9, 4, begins(1, video_length=50), {"0.step000001": [1, 2, 3, 4]}),
         # Without a length it ends with its episode.
         (5, 15, begins(3), {"0.step000003": [3, 4, 5]}),
@@ -311,8 +293,8 @@ def begins(*at, **options):
         ),
     ],
 )
-def test_a_clip_is_its_first_frame_and_n_steps(length, steps, options, shown, tmp_path):
-    """A reset adds its frame; steps are what is counted."""
+def test_clip_has_its_first_frame_and_n_steps(length, steps, options, shown, tmp_path):
+    """A reset adds a frame and does not count."""
     env = Counting(length)
     with mjrec.Monitor(env, tmp_path, allow_early_reset=True, **options) as monitor:
         done = True
@@ -321,13 +303,8 @@ def test_a_clip_is_its_first_frame_and_n_steps(length, steps, options, shown, tm
                 monitor.reset()
             _, _, done, _, _ = monitor.step(0)
     paths = sorted(tmp_path.glob("*.mp4"))
-    assert {
-        path.name.split(".video00000")[-1].removesuffix(".mp4"): [
-            round(float(frame.mean()) / 5) for frame in frames_of(path)
-        ]
-        for path in paths
-    } == shown
-    results = mjrec.load_results(tmp_path)
-    assert [Path(video).name for video, _ in results["videos"]] == [
-        path.name for path in paths
-    ]
+    for path, (name, counts) in zip(paths, shown.items(), strict=True):
+        assert path.name.endswith(f".video00000{name}.mp4")
+        assert [round(frame.mean() / 5) for frame in frames_of(path)] == counts
+    listed = [video for video, _ in mjrec.load_results(tmp_path)["videos"]]
+    assert [*map(Path, listed)] == paths

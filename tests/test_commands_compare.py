@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import functools
 import json
 import math
 
 import pytest
 
 from evaluations import write_evaluation
-from mjrec.commands import main
 
 WALK = "dm_control/walker-walk"
 SAME = {"Hopper-v5": [[5.0, 6, 7, 8]]}
@@ -15,7 +15,6 @@ BETTER = {WALK: [[500.0, 600, 700, 800]], **SAME}
 
 @pytest.fixture
 def write(tmp_path):
-    """Return what writes an evaluation, and returns its path as a text."""
     return lambda name, *arguments, **options: str(
         write_evaluation(tmp_path / name, *arguments, **options)
     )
@@ -23,23 +22,27 @@ def write(tmp_path):
 
 @pytest.fixture
 def two(write):
-    """Return two evaluations; of the first task the second is better."""
+    """Return two evaluations; the second is better on the first task."""
     return [
         write("a", WORSE, policy="mine:old"),
         write("b", BETTER, policy="mine:new", policy_kwargs={"gain": 2}),
     ]
 
 
-def told(arguments, capsys):
-    """Return what `--json` prints: one object, with nothing around it."""
-    main(["compare", *arguments, "--json", "--resamples", "200"])
-    return json.loads(capsys.readouterr().out)
+@pytest.fixture
+def compare(command):
+    return functools.partial(command, "compare")
 
 
-def test_a_table_and_a_sentence(two, write, capsys):
-    """What must be known first stands first, and what it comes to stands last."""
-    assert main(["compare", *two]) == 0
-    lines = capsys.readouterr().out.splitlines()
+@pytest.fixture
+def compared(compare):
+    """Return a function that returns the object of `--json`."""
+    fast = ("--json", "--resamples", "200")
+    return lambda *arguments, **rest: json.loads(compare(*arguments, *fast, **rest).out)
+
+
+def test_table_follows_cautions_and_precedes_the_conclusion(two, write, compare):
+    lines = compare(*two).out.splitlines()
     assert lines[0].endswith("a (policy mine:old)")
     assert lines[1].endswith("b (policy mine:new, gain=2)")
     (row,) = (line for line in map(str.strip, lines) if line.startswith(WALK))
@@ -52,14 +55,12 @@ def test_a_table_and_a_sentence(two, write, capsys):
     )
     assert lines[-1].endswith(" (scores of 1 task).")
     failed = write("c", {WALK: [[500.0, 600, None, 700]]})
-    assert main(["compare", two[0], failed]) == 0
     caution = f"Caution: {WALK}: 1 of 4 episodes of B failed"
-    assert capsys.readouterr().out.startswith(caution)
+    assert compare(two[0], failed).out.startswith(caution)
 
 
-def test_the_same_figures_as_json(two, capsys):
-    """By the names that --require takes."""
-    fields = told([*two, "--seed", "3", "--confidence", "0.9"], capsys)
+def test_json_has_the_figures_by_the_names_of_require(two, compared):
+    fields = compared(*two, "--seed", "3", "--confidence", "0.9")
     assert (fields["a"], fields["b"], fields["unmet"]) == ([two[0]], [two[1]], [])
     assert fields["bootstrap"] == {"resamples": 200, "seed": 3, "confidence": 0.9}
     figures = fields["tasks"][0]["figures"]
@@ -69,16 +70,15 @@ def test_the_same_figures_as_json(two, capsys):
     assert fields["figures"]["probability of improvement"]["value"] == 0.75
 
 
-def test_sets_of_evaluations(write, capsys):
-    """As a shell writes out `runs/a* --against runs/b*`."""
+def test_compares_sets_of_evaluations(write, compare, compared):
+    """A shell expands `runs/a* --against runs/b*` to such arguments."""
     a = [write(f"a{k}", {WALK: [[float(k)] * 2]}) for k in range(3)]
     b = [write(f"b{k}", {WALK: [[k + 2.5] * 2]}) for k in range(3)]
-    fields = told([*a, "--against", *b], capsys)
+    fields = compared(*a, "--against", *b)
     assert (fields["a"], fields["b"], fields["unit"]) == (a, b, "evaluations")
     figures = fields["tasks"][0]["figures"]
     assert (figures["mean A"]["value"], figures["mean B"]["value"]) == (1, 3.5)
-    assert main(["compare", *a, "--against", *b]) == 0
-    assert "A: 3 evaluations: " in capsys.readouterr().out
+    assert "A: 3 evaluations: " in compare(*a, "--against", *b).out
 
 
 @pytest.mark.parametrize(
@@ -96,22 +96,20 @@ def test_sets_of_evaluations(write, capsys):
         ("p-value low < 0.05", "is unknown"),
     ],
 )
-def test_what_is_required(required, reason, two, capsys):
-    """A figure of all tasks together, of each, or of one; or an end of an interval.
-
-    Where it is not there the exit status is 1, and the reason stands last.
-    """
-    status = main(["compare", *two, "--require", required])
-    last = capsys.readouterr().out.splitlines()[-1]
-    unmet = told([*two, "--require", required, "--require", "IQM A > 0"], capsys)
+def test_unmet_requirement_fails_with_reason(required, reason, two, compare, compared):
+    """A figure is of all tasks, of each or of one, or the end of an interval."""
+    status = 0 if reason is None else 1
+    requirement = ("--require", required)
+    last = compare(*two, *requirement, status=status).out.splitlines()[-1]
+    both = (*requirement, "--require", "IQM A > 0")
+    unmet = compared(*two, *both, status=status)["unmet"]
     if reason is None:
-        assert (status, unmet["unmet"]) == (0, [])
+        assert unmet == []
         assert "Not met" not in last
     else:
-        assert status == 1
         assert last.startswith(f"Not met: {required}: ")
         assert reason in last
-        assert reason in unmet["unmet"][0]
+        assert reason in unmet[0]
 
 
 @pytest.mark.parametrize(
@@ -128,16 +126,13 @@ def test_what_is_required(required, reason, two, capsys):
         (["more"], "--against"),
     ],
 )
-def test_what_cannot_be_required(options, reason, two, capsys):
-    """One error, which says what can."""
-    assert main(["compare", *two, *options]) == 1
-    err = capsys.readouterr().err
+def test_bad_input_is_one_error_with_the_valid_input(options, reason, two, compare):
+    err = compare(*two, *options, status=1).err
     assert reason in err
     assert "Traceback" not in err
 
 
-def test_no_worse_than(two):
-    """The interval decides: what is too wide is no evidence."""
+def test_no_worse_than_needs_an_interval_within_the_margin(two, compare):
     a, b = two
     for first, second, better, margin, status in (
         (a, b, "A", "0.05", 0),
@@ -146,37 +141,32 @@ def test_no_worse_than(two):
         (b, a, "A", "0.3", 1),
         (b, a, "B", "0.3", 0),
     ):
-        demand = ["--no-worse-than", better, "--margin", margin]
-        assert main(["compare", first, second, *demand]) == status
+        demand = ("--no-worse-than", better, "--margin", margin)
+        compare(first, second, *demand, status=status)
 
 
 @pytest.mark.parametrize("returns", [[None, 900.0], [math.nan, 900.0], [None, None]])
-def test_failed_episodes_and_nan_meet_no_requirement(returns, write, capsys):
-    """However good the others are; and without figures the status is always 1."""
+def test_failed_episodes_and_nan_meet_no_requirement(returns, write, compare):
+    """Without figures the status is always 1."""
     a, b = write("a", {WALK: [[1.0, 2.0]]}), write("b", {WALK: [returns]})
-    assert main(["compare", a, b, "--require", "difference > 0"]) == 1
-    capsys.readouterr()
+    compare(a, b, "--require", "difference > 0", status=1)
     has_figures, is_nan = returns == [None, 900.0], returns[0] is not None
-    assert main(["compare", a, b]) == (0 if has_figures else 1)
-    out = capsys.readouterr().out
+    out = compare(a, b, status=0 if has_figures else 1).out
     assert ("1 of 2" in out) or ("no episode of B was completed" in out)
     assert ("No task could be compared." in out) is not has_figures
-    allowed = main(["compare", a, b, "--allow-nan"])
-    assert allowed == (0 if has_figures or is_nan else 1)
+    compare(a, b, "--allow-nan", status=0 if has_figures or is_nan else 1)
 
 
-def test_text_of_files_is_no_order_to_the_terminal(write, capsys):
-    """Neither escape sequences nor rich's markup."""
+def test_text_of_files_has_no_effect_on_the_terminal(write, compare):
+    """Neither escape sequences nor rich's markup work."""
     a = write("a", {"[red]\x1b[2Jx": [[1.0, 2.0]]}, policy="[bold]\x1b[2J")
-    assert main(["compare", a, a]) == 0
-    out = capsys.readouterr().out
+    out = compare(a, a).out
     assert "\x1b" not in out
     assert "[red]\\x1b[2Jx" in out
     assert "[bold]\\x1b[2J" in out
 
 
-def test_what_a_requirement_of_scores_lacks_is_said(tmp_path, capsys):
-    """The option that gives a task its score range."""
-    a, b = (str(write_evaluation(tmp_path / n, {"x": [[1.0, 2.0]]})) for n in "ab")
-    assert main(["compare", a, b, "--no-worse-than", "A", "--margin", "0.1"]) == 1
-    assert "mjrec evaluate --resume DIR --score-range" in capsys.readouterr().out
+def test_missing_score_range_is_reported_with_its_option(write, compare):
+    a, b = (write(name, {"x": [[1.0, 2.0]]}) for name in "ab")
+    out = compare(a, b, "--no-worse-than", "A", "--margin", "0.1", status=1).out
+    assert "mjrec evaluate --resume DIR --score-range" in out

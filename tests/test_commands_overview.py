@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the command line says before it does anything."""
+"""Help, examples and completion of the command line."""
 
 import re
 import subprocess
@@ -14,22 +14,20 @@ from report_recordings import entry, write_journal
 
 
 @pytest.fixture
-def said(capsys):
-    """Return what runs the command, and gives its exit status and what it printed."""
+def text_of(capsys):
+    """Return a function that runs the command and returns all its output."""
 
-    def run(*arguments):
+    def run(*arguments, status=0):
         with pytest.raises(SystemExit) as left:
             main(arguments)
-        return left.value.code or 0, "".join(capsys.readouterr())
+        assert (left.value.code or 0) == status
+        return "".join(capsys.readouterr())
 
     return run
 
 
-def test_help_fits_a_small_terminal(said):
-    """All commands, in groups, in 24 lines of 80 columns."""
-    status, text = said("--help")
-    assert status == 0
-    lines = text.splitlines()
+def test_help_lists_all_commands_in_24_lines_of_80_columns(text_of):
+    lines = text_of("--help").splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
     assert all(group in lines for group in GROUPS)
@@ -38,7 +36,7 @@ def test_help_fits_a_small_terminal(said):
     assert {*listed} == {*COMMANDS}
 
 
-# The five options that are used most.
+# The five most used options.
 FIRST = {
     "record": "--out --episodes --policy --seed --size",
     "render": "--episode --camera --size --quality --workers",
@@ -49,14 +47,13 @@ FIRST = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_what_people_use_first(command, said):
-    """And nothing of Python: an option that need not be given is `--seed INT`."""
-    status, text = said(command, "--help")
-    assert status == 0
+def test_help_lists_the_most_used_options_first(command, text_of):
+    """An optional option is `--seed INT`, without Python's None."""
+    text = text_of(command, "--help")
     assert f"usage: mjrec {command}" in text
     assert not re.search(r"\bNone\b|\(default: (False)?\)", text)
     if command in FIRST:
-        # Lines of prose may begin with an option, too: the list is what follows -h.
+        # The list follows -h; lines of prose before it may begin with an option.
         listed = text[text.index("-h, --help") :]
         option = r"^\W*?(?:-\w(?: [A-Z]+)?, )?(--[\w-]+)"
         options = re.findall(option, listed, re.MULTILINE)
@@ -68,45 +65,41 @@ def test_help_shows_what_people_use_first(command, said):
 
 
 @pytest.mark.parametrize("command", EXAMPLES)
-def test_a_command_without_arguments_shows_examples(command, said):
-    """In place of a list of what is missing; it is an error all the same."""
-    status, text = said(command)
-    assert status == 2
+def test_command_without_arguments_shows_examples_with_status_2(command, text_of):
+    text = text_of(command, status=2)
     shown = [line.strip() for line in text.splitlines() if line.startswith("  ")]
     assert shown == list(EXAMPLES[command])
     assert all(line.startswith(f"mjrec {command} ") for line in shown)
     assert f"mjrec {command} --help" in text
 
 
-def test_alone_it_says_what_is_recorded_here(said, tmp_path, monkeypatch):
-    """Of the directory itself and of those in it; else it shows the commands."""
+def test_mjrec_alone_lists_recordings_here_and_below(text_of, tmp_path, monkeypatch):
+    """Without any it shows the commands."""
     monkeypatch.chdir(tmp_path)
-    status, text = said()
-    assert status == 2
-    assert "record  " in text
+    assert "record  " in text_of(status=2)
     first, second = tmp_path / "runs" / "first", tmp_path / "second"
     write_journal(first, "0.7", "X-v0", [entry(0), entry(1, recording="deferred")])
     write_log(first, 1, steps=2)
     write_evaluation(second, {"a/x": [[1.0, None]], "b/y": [[2.0, 3.0]]})
     (tmp_path / "torn").mkdir()
     (tmp_path / "torn" / "evaluation.json").write_text("{")
-    status, text = said()
-    assert status == 0
-    lines = text.splitlines()
+    lines = text_of().splitlines()
     assert lines[0].startswith("runs/first: 2 episodes, return ")
     assert lines[0].endswith("0 videos and 1 pending")
     assert lines[1] == "second: evaluation of 2 tasks, 4 episodes, 1 failed"
     assert lines[2].startswith("torn: cannot be read: ")
-    assert "mjrec render runs/first" in text
+    assert any("mjrec render runs/first" in line for line in lines)
     monkeypatch.chdir(first)
-    assert said()[1].startswith(".: 2 episodes")
+    assert text_of().startswith(".: 2 episodes")
 
 
-# Takes more than five seconds: a completion knows the options of all commands.
-def test_completion_completes(said):
-    """bash, with the script loaded, offers commands and a command's options."""
-    status, script = said("completion", "bash")
-    assert status == 0
+def test_unknown_option_is_status_2(text_of):
+    text_of("record", "HalfCheetah-v5", "--no-such-option", status=2)
+
+
+# Takes more than five seconds: the script has the options of all commands.
+def test_bash_completes_commands_and_options(text_of):
+    script = text_of("completion", "bash")
 
     def offered(*words):
         given = " ".join(f"'{word}'" for word in words)

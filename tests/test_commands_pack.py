@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec pack`: it says what it made, and how that is verified."""
+"""Output and options of `mjrec pack`."""
 
 import hashlib
 import json
@@ -8,20 +8,16 @@ import pytest
 from packed_runs import the, unpacked
 from recordings import videos_in
 
-from mjrec.commands import main
-
 
 @pytest.fixture(scope="module")
 def recorded(pendulums):
-    """Return a directory with two episodes, each with a video."""
-    return str(pendulums(2, longest=3))
+    return pendulums(2, longest=3)
 
 
-def test_it_says_what_it_made(recorded, tmp_path, capsys):
-    """Where, how much, its hash, and the command that verifies it."""
+def test_output_has_path_size_hash_and_how_to_verify(recorded, tmp_path, command):
     path = tmp_path / "run.zip"
-    assert main(["pack", recorded, "-o", str(path), "--anonymous"]) == 0
-    where, size, digest, advice = capsys.readouterr().out.splitlines()
+    out = command("pack", recorded, "-o", path, "--anonymous").out
+    where, size, digest, advice = out.splitlines()
     assert where == str(path)
     assert f"({path.stat().st_size} bytes)" in size
     assert digest == f"  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
@@ -29,12 +25,11 @@ def test_it_says_what_it_made(recorded, tmp_path, capsys):
     assert "withheld" in the(unpacked(path, tmp_path / "x"), "README.md").read_text()
 
 
-def test_everything_can_be_stated(recorded, tmp_path):
-    """Several authors, and a choice of episodes."""
+def test_options_set_statements_and_select_episodes(recorded, tmp_path, command):
     path = tmp_path / "run.zip"
-    arguments = ["--title", "T", "--author", "A B", "--author", "C D"]
-    more = ["--license", "MIT", "--episodes", "1, 1", "--max-size", "5M"]
-    assert main(["pack", recorded, "--out", str(path), *arguments, *more]) == 0
+    statements = ("--title", "T", "--author", "A B", "--author", "C D")
+    more = ("--license", "MIT", "--episodes", "1, 1", "--max-size", "5M")
+    command("pack", recorded, "--out", path, *statements, *more)
     folder = unpacked(path, tmp_path / "x")
     crate = json.loads(the(folder, "ro-crate-metadata.json").read_text())
     root = next(entity for entity in crate["@graph"] if entity["@id"] == "./")
@@ -52,10 +47,9 @@ def test_everything_can_be_stated(recorded, tmp_path):
         (["--max-size", "1k"], "The largest files"),
     ],
 )
-def test_errors_are_one_message(arguments, part, recorded, tmp_path, capsys):
-    """And nothing is made."""
-    assert main(["pack", recorded, "-o", str(tmp_path / "run.zip"), *arguments]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert part in said.err
+def test_error_leaves_only_a_message(arguments, part, recorded, tmp_path, command):
+    path = tmp_path / "run.zip"
+    out, err = command("pack", recorded, "-o", path, *arguments, status=1)
+    assert out == ""
+    assert part in err
     assert list(tmp_path.iterdir()) == []

@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec render`: what it says, and how it ends. `test_render_videos` has the rest."""
+"""Output and exit status of `mjrec render`."""
 
+import functools
 import json
 
 import pytest
 from recordings import frames_of, manifest_of
-from trajectories_by_hand import (
-    INFIX,
-    write_finished,
-    write_log,
-    write_pending_manifest,
-)
+from trajectories_by_hand import write_finished, write_log, write_pending_manifest
 
 from mjrec import clear_monitor_files
-from mjrec.commands import main
 from mjrec.rendering.jobs import RecordingKey, Variant, View
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
@@ -24,88 +19,75 @@ pytestmark = pytest.mark.usefixtures("painter")
 
 
 @pytest.fixture
-def mjrec(capsys):
-    """Run the command; returns the exit status and what it printed."""
-    return lambda *rest: (main(["render", *map(str, rest)]), *capsys.readouterr())
+def render(command):
+    return functools.partial(command, "render")
 
 
 def content_of(directory):
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-def test_pending_videos_are_rendered(tmp_path, mjrec):
-    """Each is told when it is there, and where they are at the end."""
+def test_pending_videos_are_rendered_and_listed(tmp_path, render):
     write_finished(tmp_path, 0)
     write_log(tmp_path, 1)
     write_pending_manifest(tmp_path, 0, 1)
-    status, out, _ = mjrec(tmp_path)
-    assert status == 0
-    assert out.splitlines() == [
+    assert render(tmp_path).out.splitlines() == [
         "openaigym.video.0.7.video000000.mp4: 5 frames",
         "openaigym.video.0.7.video000001.mp4: 5 frames",
         "2 videos rendered, in",
         f"  {tmp_path}",
     ]
-    status, out, _ = mjrec(tmp_path, "--pending")
-    assert (status, out) == (0, f"Nothing is pending in {tmp_path}.\n")
-    status, _, err = mjrec(tmp_path, "--episode", 1)
-    assert status == 1
-    assert "--camera" in err
+    assert render(tmp_path, "--pending").out == f"Nothing is pending in {tmp_path}.\n"
+    assert "--camera" in render(tmp_path, "--episode", 1, status=1).err
 
 
-def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec):
-    """The others are; the exit status tells, and so does one JSON object."""
+def test_failures_are_listed_with_reasons_as_text_and_as_json(tmp_path, render):
     write_finished(tmp_path, 0).write_bytes(b"torn")
     write_finished(tmp_path, 1, frames=False)
     write_finished(tmp_path, 2)
     write_finished(tmp_path, 3)
-    lock = claim(tmp_path, RecordingKey(INFIX, 3))
-    status, out, _ = mjrec(tmp_path)
-    assert status == 1
+    lock = claim(tmp_path, RecordingKey("0.7", 3))
+    out = render(tmp_path, status=1).out
     assert "1 video rendered" in out
     assert "1 video being rendered by another process" in out
     assert "2 videos could not be rendered:" in out
     assert "nothing to draw frames from" in out
     lock.release()
-    status, out, _ = mjrec(tmp_path, "--json")
-    assert status == 1
-    report = json.loads(out)
+    report = json.loads(render(tmp_path, "--json", status=1).out)
     assert report["directory"] == str(tmp_path)
     name = "openaigym.video.0.7.video000003.mp4"
     assert report["videos"] == [{"name": name, "frame_count": 5}]
     assert len(report["failures"]) == 2
     assert (report["elsewhere"], report["interrupted"]) == ([], False)
-    _, out, _ = mjrec(tmp_path, "--engine", "local", "--workers", 1, "--json")
+    local = ("--engine", "local", "--workers", 1, "--json")
+    out = render(tmp_path, *local, status=1).out
     assert json.loads(out)["failures"] == report["failures"]
 
 
-def test_one_episode_can_be_finished_or_shown_another_way(tmp_path, mjrec):
-    """By its number, its trajectory, or the video's name, which one sees and copies."""
+def test_episode_is_selected_by_number_trajectory_or_video(tmp_path, render):
     trajectories = [write_finished(tmp_path, k) for k in range(3)]
-    assert mjrec(tmp_path, "--episode", 1)[0] == 0
-    assert mjrec(trajectories[2])[0] == 0
+    render(tmp_path, "--episode", 1)
+    render(trajectories[2])
     rendered = {path.name[-10:] for path in tmp_path.glob("*.mp4")}
     assert rendered == {"000001.mp4", "000002.mp4"}
     [video, _] = sorted(tmp_path.glob("*.mp4"))
-    assert mjrec(video, "--camera", "side")[0] == 0
+    render(video, "--camera", "side")
     assert video.with_suffix(".side.mp4").exists()
 
 
-def test_another_view_is_a_new_file_beside_the_original(tmp_path, mjrec, painter):
-    """Nothing that is there changes, and readers do not take it for the original."""
+def test_another_view_makes_new_files_and_changes_none(tmp_path, render, painter):
     write_finished(tmp_path)
     write_pending_manifest(tmp_path, 0)
-    mjrec(tmp_path)
+    render(tmp_path)
     before = content_of(tmp_path)
     view = ("--camera", "top view", "--size", "64x32", "--quality", "draft")
     rates = ("--max-fps", 10, "--fps", 29.97)
-    status, out, _ = mjrec(tmp_path, "--episode", 0, *view, *rates)
+    out = render(tmp_path, "--episode", 0, *view, *rates).out
     name = f"{VIDEO}.top%20view.64x32.draft.max10fps.29%2E97fps"
-    assert status == 0
     assert f"{name}.mp4: 3 frames" in out
     after = content_of(tmp_path)
-    said = json.loads(after[f"{name}.meta.json"])
-    assert (said["camera"], said["quality"]) == ("top view", "draft")
+    metadata = json.loads(after[f"{name}.meta.json"])
+    assert (metadata["camera"], metadata["quality"]) == ("top view", "draft")
     assert {key: after[key] for key in before} == before
     new = {f"{name}.{end}" for end in ("mp4", "framehash", "meta.json")}
     assert set(after) - set(before) == new
@@ -115,8 +97,8 @@ def test_another_view_is_a_new_file_beside_the_original(tmp_path, mjrec, painter
     assert not list(tmp_path.iterdir())
 
 
-def test_every_variant_has_a_name_of_its_own():
-    """Also where a camera is called as a quality, a size or a rate would be."""
+def test_variants_have_distinct_names():
+    """Even if a camera has the name of a quality, a size or a rate."""
     cameras = ["side", 0, "draft", "64x32", "max10fps", "10fps", "camera-draft"]
     views = [View(quality="draft"), View(width=64, height=32)]
     views += [View(camera=camera) for camera in cameras]
@@ -128,14 +110,11 @@ def test_every_variant_has_a_name_of_its_own():
     assert {f"{VIDEO}.camera-draft.mp4", f"{VIDEO}.side.mp4"} < names
 
 
-def test_out_names_the_file(tmp_path, mjrec):
-    """As recorded if nothing else is said, whatever the trajectory is called."""
+def test_out_names_the_video_of_a_renamed_trajectory(tmp_path, render):
     trajectory = write_finished(tmp_path).rename(tmp_path / "copy.h5")
     out = tmp_path / "elsewhere" / "mine.mp4"
     out.parent.mkdir()
-    status, printed, _ = mjrec(trajectory, "--out", out)
-    assert status == 0
-    assert str(out.parent) in printed
+    assert str(out.parent) in render(trajectory, "--out", out).out
     assert len(frames_of(out)) == 5
     assert {path.name for path in tmp_path.glob("*.*")} == {"copy.h5"}
 
@@ -153,22 +132,16 @@ def test_out_names_the_file(tmp_path, mjrec):
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
     ],
 )
-def test_what_cannot_be_is_one_clear_error(
-    arguments, message, tmp_path, mjrec, monkeypatch
-):
-    """And nothing is written."""
+def test_bad_input_writes_nothing(arguments, message, tmp_path, render, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id)
     before = content_of(tmp_path)
-    status, out, err = mjrec(tmp_path, *arguments)
-    assert status == 1
-    assert message in out + err
+    assert message in "".join(render(tmp_path, *arguments, status=1))
     assert content_of(tmp_path) == before
 
 
-def test_ctrl_c_is_status_130(tmp_path, mjrec, painter):
-    """What is done stays, and nothing half-done."""
+def test_ctrl_c_keeps_finished_videos_and_is_status_130(tmp_path, render, painter):
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id)
 
@@ -177,22 +150,18 @@ def test_ctrl_c_is_status_130(tmp_path, mjrec, painter):
             raise KeyboardInterrupt
 
     painter.breaks_at = interrupt
-    status, out, _ = mjrec(tmp_path)
-    assert status == 130
-    assert "Interrupted." in out
+    assert "Interrupted." in render(tmp_path, status=130).out
     assert [path.name for path in tmp_path.glob("*.mp4")] == [f"{VIDEO}.mp4"]
     assert not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize("again_at", [(), ("--fps", "30")])
-def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, painter):
-    """The videos are there, also in the manifest, and none is pending any more."""
+@pytest.mark.parametrize("rates", [(), ("--fps", "30")])
+def test_strict_fails_after_rendering_blank_videos(rates, tmp_path, render, painter):
     painter.plain = True
     write_finished(tmp_path, 0)
     write_pending_manifest(tmp_path, 0)
-    status, out, _ = mjrec(tmp_path, "--strict", *again_at)
-    assert status == 1
+    out = render(tmp_path, "--strict", *rates, status=1).out
     assert "1 video rendered, but blank:" in out
     assert "all 5 frames are a single color" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
-    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == bool(again_at)
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == bool(rates)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a confined process can see, write and reach."""
+"""A confined process sees, writes and reaches only its files."""
 
 from pathlib import Path
 
@@ -32,8 +32,8 @@ say(
 """
 
 
-def test_a_confined_process_sees_what_it_is_given(tmp_path, monkeypatch):
-    """No other file, home or token; what drawing needs is there."""
+def test_confined_process_reaches_only_its_files(tmp_path, monkeypatch):
+    """It sees no token, network or real home, and keeps what drawing needs."""
     folders = {name: tmp_path / name for name in ("readable", "other", "place")}
     for folder in (*folders.values(), tmp_path / "modules"):
         folder.mkdir()
@@ -54,8 +54,7 @@ def test_a_confined_process_sees_what_it_is_given(tmp_path, monkeypatch):
         assert (seen["other"], seen["written_elsewhere"]) == (False, False)
 
 
-def test_confining_needs_no_library():
-    """It begins before anything is imported that could start a thread."""
+def test_confining_imports_nothing_that_could_start_a_thread():
     text = Path(confine.__code__.co_filename).read_text()
     assert "from ." not in text
     assert "numpy" not in text

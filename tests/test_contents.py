@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What cannot be packed is refused before anything is made, and nothing stays."""
+"""`pack` rejects what it cannot pack, and leaves nothing then."""
 
 import json
 import shutil
@@ -21,19 +21,18 @@ from mjrec.evidence.statements import state
 
 @pytest.fixture(scope="module")
 def recorded(pendulums):
-    """Return a directory with two episodes, each with a video."""
     return pendulums(2, longest=3)
 
 
 @pytest.fixture
 def directory(recorded, tmp_path):
-    """Return a copy of it, to be spoilt."""
+    """Return a copy of the recordings, for tests to damage."""
     return shutil.copytree(recorded, tmp_path / "runs")
 
 
 @pytest.fixture
 def place(tmp_path):
-    """Return where an archive may be put; after the test, nothing is there."""
+    """Return the path of an archive; after the test, its folder is empty."""
     folder = tmp_path / "place"
     folder.mkdir()
     yield folder / "run.zip"
@@ -42,22 +41,21 @@ def place(tmp_path):
 
 @pytest.fixture
 def live(tmp_path, make_corridor, play):
-    """Return a directory with one episode, whose video is live."""
+    """Return recordings of one episode with a live video."""
     with mjrec.Monitor(make_corridor(), tmp_path / "runs") as env:
         play(env, 1)
     return tmp_path / "runs"
 
 
 def refusal(kind, directory, path, **options):
-    """Return the message with which packing is refused."""
+    """Return the message of the error that packing raises."""
     with pytest.raises(kind) as caught:
         mjrec.pack(directory, path, **options)
     assert type(caught.value) is kind
     return str(caught.value)
 
 
-def test_an_open_monitor_is_named(tmp_path, place, make_corridor):
-    """Its files are still being written."""
+def test_open_monitor_is_named(tmp_path, place, make_corridor):
     with mjrec.Monitor(make_corridor(), tmp_path / "runs") as env:
         env.reset()
         message = refusal(mjrec.DirectoryInUse, tmp_path / "runs", place)
@@ -65,23 +63,14 @@ def test_an_open_monitor_is_named(tmp_path, place, make_corridor):
         assert "Close the monitor" in message
 
 
-def pending(runs):
-    honest_runs.pendulum(runs, episodes=1, workers=0)
-
-
-def killed(runs):
-    runs.mkdir()
-    write_log(runs, ended=False)
-
-
-@pytest.mark.parametrize(
-    ("record", "command"), [(pending, "render"), (killed, "recover")]
-)
-def test_recordings_are_to_be_finished_first(record, command, tmp_path, place):
-    """The message has the command."""
-    record(tmp_path / "runs")
-    message = refusal(mjrec.UnfinishedRecordings, tmp_path / "runs", place)
-    assert f"mjrec {command} {tmp_path}/runs" in message
+def test_unfinished_recordings_are_rejected_with_the_command(tmp_path, place):
+    pending, killed = tmp_path / "pending", tmp_path / "killed"
+    honest_runs.pendulum(pending, episodes=1, workers=0)
+    killed.mkdir()
+    write_log(killed, ended=False)
+    for runs, command in ((pending, "render"), (killed, "recover")):
+        message = refusal(mjrec.UnfinishedRecordings, runs, place)
+        assert f"mjrec {command} {runs}" in message
 
 
 def remove(pattern):
@@ -108,31 +97,32 @@ def lead_out(directory):
     ("spoil", "kind", "part"),
     [
         (add_a_stray_video, mjrec.UnfinishedRecordings, "openaigym.video.9.x.*manifes"),
-        # It counts as pending.
+        # Its video counts as pending.
         (remove("*000000.mp4"), mjrec.UnfinishedRecordings, "mjrec render .*runs"),
         (remove("*.stats.json"), mjrec.UnfinishedRecordings, "results are missing"),
         (damage_a_trajectory, mjrec.UnreadableFile, "000001.h5"),
         (lead_out, mjrec.UnreadableFile, "leads out of its directory"),
     ],
 )
-def test_what_is_not_whole_is_refused(directory, place, spoil, kind, part):
-    """With the file, and with what makes it whole where something can."""
+def test_damaged_recordings_are_rejected(directory, place, spoil, kind, part):
     spoil(directory)
     with pytest.raises(kind, match=f"(?s){part}"):
         mjrec.pack(directory, place)
 
 
-def test_a_live_video_that_is_gone_is_missed(live, place):
-    """The archive would not be verified."""
-    gone = the(live, "*.mp4")
-    gone.unlink()
-    assert f"names {gone.name}, which is missing" in refusal(
-        mjrec.PackError, live, place
-    )
+def test_live_videos_must_exist_and_are_never_encoded_again(live, place):
+    """There is nothing to draw them from."""
+    video = the(live, "*.mp4")
+    content = video.read_bytes()
+    message = refusal(mjrec.ArchiveTooLarge, live, place, max_size=1000)
+    assert "never re-encoded" in message
+    assert video.read_bytes() == content
+    video.unlink()
+    message = refusal(mjrec.PackError, live, place)
+    assert f"names {video.name}, which is missing" in message
 
 
-def test_links_inside_are_packed_as_files(directory, tmp_path):
-    """No archive holds a link."""
+def test_links_within_the_directory_are_packed_as_files(directory, tmp_path):
     video = the(directory, "*000000.mp4")
     video.rename(directory / "elsewhere")
     video.symlink_to("elsewhere")
@@ -142,16 +132,7 @@ def test_links_inside_are_packed_as_files(directory, tmp_path):
     assert not packed.is_symlink()
 
 
-def test_unknown_episodes_are_named(recorded, place):
-    """With those that there are."""
-    message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
-    assert message.endswith("with the number 9. Available: 0, 1.")
-    for wrong in ([], [True], ["0"], [0.0]):
-        refusal(mjrec.InvalidArgument, recorded, place, episodes=wrong)
-
-
-def test_an_existing_archive_is_never_replaced(recorded, tmp_path):
-    """Also a link that leads nowhere."""
+def test_existing_archive_or_broken_link_is_never_replaced(recorded, tmp_path):
     path = tmp_path / "run.zip"
     path.symlink_to("nowhere")
     assert "already exists" in refusal(mjrec.InvalidArgument, recorded, path)
@@ -159,21 +140,20 @@ def test_an_existing_archive_is_never_replaced(recorded, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.tar", ".run.zip", "openaigym.zip", "\n.zip"])
-def test_an_archive_has_a_name_of_its_own(name, recorded, place):
-    """Which is not that of a monitor's file."""
+def test_archive_names_must_end_in_zip_and_be_no_monitor_file(name, recorded, place):
     refusal(mjrec.InvalidArgument, recorded, place.with_name(name))
 
 
-def test_there_must_be_recordings(tmp_path, place):
-    """The message says how to make some."""
+def test_directories_without_recordings_are_errors(tmp_path, place):
     message = refusal(mjrec.InvalidArgument, tmp_path / "nothing", place)
     assert "does not exist" in message
     assert "mjrec record" in refusal(mjrec.InvalidArgument, tmp_path, place)
 
 
 @pytest.mark.parametrize(
-    ("stated", "part"),
+    ("options", "part"),
     [
+        *(({"episodes": bad}, "episodes") for bad in ([], [True], ["0"], [0.0])),
         ({"authors": ["Ada <0000-0002-1825-0098>"]}, "An author must be"),
         ({"authors": ["Ada <not an address>"]}, "An author must be"),
         ({"authors": "Ada"}, "a list of strings"),
@@ -184,13 +164,17 @@ def test_there_must_be_recordings(tmp_path, place):
         ({"max_size": 0}, "max_size"),
     ],
 )
-def test_what_is_stated_is_checked(stated, part, recorded, place):
-    """Before any work."""
-    assert part in refusal(mjrec.InvalidArgument, recorded, place, **stated)
+def test_invalid_options_are_rejected(options, part, recorded, place):
+    assert part in refusal(mjrec.InvalidArgument, recorded, place, **options)
 
 
-def test_statements_are_understood():
-    """Names in both orders; a licence by its URL; a million for each M."""
+def test_unknown_episodes_are_named_with_the_known(recorded, place):
+    message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
+    assert message.endswith("with the number 9. Available: 0, 1.")
+
+
+def test_authors_licenses_and_sizes_are_parsed():
+    """Names in both orders, licenses as URLs, sizes with units."""
     authors = ["Plato", "Ludwig van Beethoven <L@b.de>", "van Beethoven, Ludwig"]
     stated = state(title="t", authors=authors, license="https://x.y/l")
     assert [(a.given, a.family, a.email) for a in stated.authors] == [
@@ -203,23 +187,20 @@ def test_statements_are_understood():
     assert {text: byte_count(text) for text in sizes} == sizes
 
 
-def test_without_jinja_it_says_what_to_install(recorded, place, monkeypatch):
-    """And does nothing."""
+def test_missing_jinja_is_an_error_with_the_fix(recorded, place, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    message = refusal(mjrec.MissingDependency, recorded, place)
-    assert 'pip install "mjrec[evidence]"' in message
+    install = 'pip install "mjrec[evidence]"'
+    assert install in refusal(mjrec.MissingDependency, recorded, place)
 
 
-def test_a_full_disk_leaves_nothing(recorded, place):
-    """One error that names the archive's file."""
+def test_full_disk_is_an_error_and_leaves_nothing(recorded, place):
     with file_size_limit(2000):
-        message = refusal(mjrec.FileNotWritten, recorded, place)
-    assert "pack again" in message
+        assert "pack again" in refusal(mjrec.FileNotWritten, recorded, place)
 
 
 @pytest.mark.usefixtures("no_process_is_left")
-def test_ctrl_c_leaves_nothing(recorded, tmp_path, place):
-    """Here while videos are drawn smaller; no process goes on either."""
+def test_ctrl_c_leaves_no_file_and_no_process(recorded, tmp_path, place):
+    """Here while it renders smaller videos."""
     size = mjrec.pack(recorded, tmp_path / "run.zip").stat().st_size
 
     def interrupt(progress):
@@ -230,31 +211,23 @@ def test_ctrl_c_leaves_nothing(recorded, tmp_path, place):
         mjrec.pack(recorded, place, max_size=size - 500, on_progress=interrupt)
 
 
-def test_too_large_is_refused_with_what_is_large(recorded, place):
-    """Nothing is drawn where even no videos at all would not help."""
-    told = []
+def test_too_large_archives_are_rejected_with_the_largest_files(recorded, place):
+    """Nothing is rendered if an archive without videos would be too large."""
+    reports = []
     with pytest.raises(mjrec.ArchiveTooLarge) as caught:
-        mjrec.pack(recorded, place, max_size=1000, on_progress=told.append)
+        mjrec.pack(recorded, place, max_size=1000, on_progress=reports.append)
     error = caught.value
     assert error.limit == 1000 < error.size
     sizes = [size for _, size in error.largest]
     assert sizes == sorted(sizes, reverse=True)
     assert error.largest[0][0] in str(error)
     assert "--episodes" in str(error)
-    assert told == []
-
-
-def test_live_videos_are_never_encoded_again(live, place):
-    """There is nothing to draw them from."""
-    video = the(live, "*.mp4").read_bytes()
-    message = refusal(mjrec.ArchiveTooLarge, live, place, max_size=1000)
-    assert "never re-encoded" in message
-    assert the(live, "*.mp4").read_bytes() == video
+    assert reports == []
 
 
 @parametrize("case", ["0.7.4/plain", "0.21.0/two_monitors", "0.12.1/text"])
-def test_what_gym_wrote_can_be_packed(case, tmp_path):
-    """It has less to say, and nothing of it is wrong; episodes cannot be chosen."""
+def test_recordings_of_gym_are_packed_and_verified(case, tmp_path):
+    """Their episodes cannot be selected."""
     directory = Path(__file__).parent / "data/gym" / case
     archive = mjrec.pack(directory, tmp_path / "run.zip")
     assert mjrec.verify(archive, level="files").failures == ()
@@ -262,8 +235,8 @@ def test_what_gym_wrote_can_be_packed(case, tmp_path):
     assert "gym's own" in refusal(mjrec.InvalidArgument, directory, other, episodes=[0])
 
 
-def test_names_with_a_percent_sign_make_an_older_bag(tmp_path):
-    """Which the `bagit` package, and sha512sum, read as they are."""
+def test_names_with_a_percent_sign_use_an_older_bagit_version(tmp_path):
+    """`bagit` and sha512sum read such names there."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data/video.front%2Fleft.mp4").write_bytes(b"1")
     make_bag(tmp_path, date="2026-11-24", title="Recordings")
@@ -272,8 +245,8 @@ def test_names_with_a_percent_sign_make_an_older_bag(tmp_path):
     assert "data/video.front%2Fleft.mp4\n" in listed
 
 
-def test_anonymous_names_no_author(recorded, tmp_path):
-    """Also where one was given; and what cannot be taken out is an error."""
+def test_anonymous_archives_name_no_author(recorded, tmp_path):
+    """An author in the title is an error."""
     options = {"anonymous": True, "authors": ["Zebulon Quackenbush"]}
     archive = mjrec.pack(recorded, tmp_path / "a.zip", **options)
     folder = unpacked(archive, tmp_path / "x")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of dm_control's environments, and their resets without OpenGL."""
+"""dm_control environments: scenes, obstacles, and resets without OpenGL."""
 
 import json
 
@@ -30,7 +30,7 @@ def load(domain="cheetah", task="run", **kwargs):
 
 
 def begun(env, directory, **asked):
-    """Return the facts of the scene of an episode that begins now."""
+    """Return the facts of the scene of a new episode."""
     states = dm_control_scenes(env, **asked).states
     states.open(directory)
     with states.resetting():
@@ -42,8 +42,8 @@ def begun(env, directory, **asked):
     return dict(start.scene)
 
 
-def test_a_scene_is_that_of_physics_where_physics_can_draw_it(tmp_path):
-    """Its size, geoms and option, anew each time; not too large, no own camera."""
+def test_scene_equals_that_of_physics_render(tmp_path):
+    """A large frame or a camera object uses another scene."""
     scene = begun(load(), tmp_path)
     assert (scene["height"], scene["width"], scene["label"]) == (240, 320, -1)
     assert (scene["fresh"], scene["max_geom"]) == (True, 1000)
@@ -55,9 +55,7 @@ def test_a_scene_is_that_of_physics_where_physics_can_draw_it(tmp_path):
         assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
 
 
-def test_a_physics_that_overrides_is_named():
-    """Of a class, or on the object."""
-
+def test_overridden_render_of_physics_is_an_obstacle():
     class Drawing(Physics):
         def render(self, *args, **kwargs):
             return 255 - super().render(*args, **kwargs)
@@ -72,8 +70,8 @@ def test_a_physics_that_overrides_is_named():
     assert "Physics overrides render()" in dm_control_scenes(env).obstacle
 
 
-def test_what_makes_the_environment_again():
-    """Its name, wrappers and least limit; a generator with the state draws the same."""
+def test_environment_facts_suffice_to_make_it_again():
+    """They include the state of the random generator."""
 
     class Opaque:
         __slots__ = ()
@@ -97,8 +95,7 @@ def test_what_makes_the_environment_again():
     assert again.rand() == env.task.random.rand()
 
 
-def test_composers_model_is_stored_as_it_was_written(tmp_path):
-    """With what makes it again in any version of MuJoCo."""
+def test_composers_model_is_stored_with_its_sources(tmp_path):
     env = manipulation.load("reach_site_features", seed=1)
     scenes = dm_control_scenes(env)
     assert scenes.obstacle is None
@@ -116,8 +113,8 @@ def rat_in_a_bowl():
 
 
 @pytest.mark.parametrize("make", [lambda: load("quadruped", "escape"), rat_in_a_bowl])
-def test_terrain_is_made_without_gl(make, monkeypatch):
-    """Where a reset asks for the context, and only inside a recorded reset."""
+def test_terrain_is_made_without_opengl(make, monkeypatch):
+    """A reset asks for the context, which a recorded reset replaces."""
     # As with MUJOCO_GL=disable.
     monkeypatch.setattr(_render, "Renderer", _render._no_renderer())
     env = make()
@@ -131,8 +128,7 @@ def test_terrain_is_made_without_gl(make, monkeypatch):
         env.reset()
 
 
-def test_a_reset_that_draws_gets_its_frames():
-    """Pixel observations are the same, and the contexts are real ones by then."""
+def test_reset_that_draws_pixels_gets_equal_frames():
     kwargs = {"height": 24, "width": 32, "camera_id": 0}
     plain, recorded = (
         pixels.Wrapper(load("quadruped", "escape"), render_kwargs=kwargs)
@@ -148,8 +144,7 @@ def test_a_reset_that_draws_gets_its_frames():
         env.physics.free()
 
 
-def test_a_reset_leaves_the_contexts_as_they_were():
-    """After an error no stand-in stays behind; real ones are the user's."""
+def test_reset_restores_the_contexts():
     env = load()
     with pytest.raises(ZeroDivisionError), ContextsOnDemand(env).resetting():
         env.physics.render(1 / 0)

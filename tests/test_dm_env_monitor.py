@@ -3,21 +3,20 @@ import tempfile
 
 import numpy as np
 import pytest
+from absl.testing import absltest
+from recordings import frames_in, journal_of, metadata_of
+
+import mjrec
 
 dm_env = pytest.importorskip("dm_env", reason="dm_env comes with dm_control")
 
-from absl.testing import absltest  # noqa: E402  after importorskip
-from dm_env import specs  # noqa: E402  after importorskip
-from dm_env import test_utils as dm_env_test_utils  # noqa: E402  after importorskip
-from recordings import frames_in, journal_of, metadata_of  # noqa: E402  after importorskip
-
-import mjrec  # noqa: E402  after importorskip
+from dm_env import specs, test_utils  # noqa: E402  after importorskip
 
 pytestmark = pytest.mark.dm_control
 
 
 class Countdown(dm_env.Environment):
-    """Counts `length` steps down; a discount of 0 ends the task."""
+    """Counts `length` steps down; a discount of 0 terminates."""
 
     def __init__(self, length=3, discount=0.0):
         self.length = length
@@ -54,8 +53,8 @@ def zeros(env):
     return np.zeros(env.action_spec().shape)
 
 
-class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
-    """dm_env's own conformance test of the monitor."""
+class ContractTest(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    """The conformance test of dm_env, applied to the monitor."""
 
     def make_object_under_test(self):
         directory = tempfile.TemporaryDirectory()
@@ -63,8 +62,7 @@ class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
         return mjrec.Monitor(Countdown(), directory.name, video_callable=False)
 
 
-def test_steps_that_are_resets(tmp_path):
-    """Before the first reset and after the last step; whatever was before."""
+def test_step_resets_before_the_first_and_after_the_last_step(tmp_path):
     inner = Countdown()
     inner.reset()
     inner.step(np.zeros(1))
@@ -75,7 +73,7 @@ def test_steps_that_are_resets(tmp_path):
             env.step(zeros(env))
     assert env.get_episode_lengths() == [3, 3]
     assert env.get_episode_rewards() == [1.5, 1.5]
-    # After close calls go straight to the environment, which was closed once.
+    # After close, calls reach the environment, which was closed once.
     env.close()
     assert inner.closed == 1
     assert env.step(zeros(env)).first()
@@ -83,8 +81,8 @@ def test_steps_that_are_resets(tmp_path):
 
 
 @pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
-def test_reset_is_allowed_at_any_time(tmp_path, discount, terminated):
-    """If not forbidden; a last step's discount tells the task's end from a limit."""
+def test_early_resets_are_allowed_unless_forbidden(tmp_path, discount, terminated):
+    """The last discount tells termination from truncation."""
     inner = Countdown(discount=discount)
     with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
         env.reset()
@@ -104,20 +102,21 @@ def test_reset_is_allowed_at_any_time(tmp_path, discount, terminated):
             env.reset()
 
 
-def test_environment_that_cannot_be_drawn_is_an_error(tmp_path):
-    """It names the way out, and nothing is left; nor where an option does nothing."""
+def test_impossible_options_are_errors_and_leave_nothing(tmp_path):
     inner = Countdown()
     with pytest.raises(mjrec.NoPictures, match="video_callable=False"):
         mjrec.Monitor(inner, tmp_path / "new")
-    for option, said in ({"camera": 0}, "no physics"), ({"episode_info": True}, "info"):
-        with pytest.raises(mjrec.InvalidArgument, match=said):
+    for option, message in (
+        ({"camera": 0}, "no physics"),
+        ({"episode_info": True}, "info"),
+    ):
+        with pytest.raises(mjrec.InvalidArgument, match=message):
             mjrec.Monitor(inner, tmp_path / "new", **option)
     assert not (tmp_path / "new").exists()
     assert inner.closed == 0
 
 
-def test_records_dm_control(tmp_path):
-    """Five frames of four steps; the environment's own attributes are there."""
+def test_records_dm_control_and_passes_on_its_attributes(tmp_path):
     suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
     task_kwargs = {"random": 0, "time_limit": 0.04}
     cheetah = suite.load("cheetah", "run", task_kwargs=task_kwargs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README, tutorial, pages and examples agree with the program, and the site builds."""
+"""README, pages and examples agree with the program, and the site builds."""
 
 import os
 import re
@@ -31,7 +31,7 @@ def blocks(text, language):
 
 
 def run(*command, cwd):
-    """Run a command that finds `mjrec` where this Python has it."""
+    """Run a command, which finds `mjrec` beside this Python."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = {**os.environ, "PATH": path}
     done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True)
@@ -44,8 +44,7 @@ def needs_extras(text):
         pytest.importorskip("dm_control", reason="dm_control is not installed here")
 
 
-def test_texts_stay_short():
-    """README and pages have at most 12,000 words, as `wc -w` counts; some less."""
+def test_texts_stay_within_their_word_limits():
     words = {path: len(path.read_text().split()) for path in DOCS.rglob("*.md")}
     assert sum(words.values()) + len(README.split()) <= 12_000
     assert words[DOCS / "decisions.md"] <= 1_500
@@ -54,12 +53,8 @@ def test_texts_stay_short():
     assert README.count("![") == 1
 
 
-# --- README -----------------------------------------------------------------------
-
-
-# Takes more than five seconds: the README's own size, 480x480, drawn in software.
-def test_python_block_leaves_what_is_shown(tmp_path):
-    """The program runs as it stands, and its directory holds the files below it."""
+# Takes more than five seconds: it draws the README's 480x480 frames in software.
+def test_readme_program_leaves_the_files_that_readme_shows(tmp_path):
     [code], [tree] = blocks(README, "python"), blocks(README, "text")
     run(sys.executable, "-c", code, cwd=tmp_path)
     there = (tmp_path / "recordings" / "halfcheetah").iterdir()
@@ -72,8 +67,7 @@ def test_python_block_leaves_what_is_shown(tmp_path):
 @pytest.mark.parametrize(
     "line", re.findall(r"^mjrec [^#\n]*", "".join(blocks(README, "sh")), re.MULTILINE)
 )
-def test_command_runs(line, tmp_path):
-    """As it stands, and it says which videos it made."""
+def test_readme_command_runs_and_names_its_videos(line, tmp_path):
     needs_extras(line)
     out = run(sys.executable, "-m", *shlex.split(line), cwd=tmp_path)
     assert ".mp4" in out
@@ -81,26 +75,20 @@ def test_command_runs(line, tmp_path):
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_scripts_demo_runs(tmp_path):
-    """The first command: twenty episodes, six videos, two tables."""
+def test_demo_makes_twenty_episodes_and_six_videos(tmp_path):
     assert "\nscripts/demo " in README
     out = run(str(ROOT / "scripts" / "demo"), str(tmp_path / "demo"), cwd=ROOT)
     assert len(list((tmp_path / "demo").glob("*/*.mp4"))) == 6
     assert out.count("truncated") == 20
 
 
-def test_links_lead_somewhere():
-    """Images and pages of the README are there."""
+def test_links_of_the_readme_exist():
     targets = re.findall(r"\]\((?!https?:)([^)#]+)", README)
     assert targets
     assert [target for target in targets if not (ROOT / target).exists()] == []
 
 
-# --- The tutorial -----------------------------------------------------------------
-
-
 def tutorial_commands():
-    """Yield each command of the tutorial and the output it shows."""
     for block in blocks(TUTORIAL, "console"):
         for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             command, _, output = part.partition("\n")
@@ -108,7 +96,7 @@ def tutorial_commands():
 
 
 def normalized(text):
-    """Return the lines without what differs from machine to machine."""
+    """Return the lines without values that differ between machines."""
     text = re.sub(r"\.0\.\d+\.video", ".0.4711.video", text)
     text = re.sub(r"-?\d+\.\d+(e-\d+)?", "#", text)
     text = re.sub(r"sha256 [0-9a-f]{64}", "sha256 #", text)
@@ -117,14 +105,12 @@ def normalized(text):
     return [line for line in lines if line]
 
 
-# Takes minutes: it records, draws, evaluates twice, packs and verifies.
+# Takes minutes: it records, renders, evaluates twice, packs and verifies.
 @pytest.mark.thorough
 @pytest.mark.timeout(1500)
 def test_tutorial_shows_what_its_commands_print(tmp_path):
-    """Each command prints what stands below it, and the whole ends in an archive."""
-    for name, text in re.findall(
-        r'```python title="(\S+)"\n(.*?)```', TUTORIAL, re.DOTALL
-    ):
+    program = r'```python title="(\S+)"\n(.*?)```'
+    for name, text in re.findall(program, TUTORIAL, re.DOTALL):
         (tmp_path / name).write_text(text)
     for command, output in tutorial_commands():
         printed = run("bash", "-c", command, cwd=tmp_path)
@@ -139,12 +125,8 @@ def test_tutorial_shows_what_its_commands_print(tmp_path):
     assert (tmp_path / "run.zip").is_file()
 
 
-# --- The site ---------------------------------------------------------------------
-
-
-# Takes more than five seconds: every page, and every docstring behind the names.
-def test_site_builds_without_a_warning(tmp_path):
-    """No dead link or anchor, no page outside the navigation, no broken docstring."""
+# Takes more than five seconds: it reads every page and public docstring.
+def test_site_builds_without_warnings(tmp_path):
     pytest.importorskip("mkdocs", reason="the documentation's tools are not here")
     build = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir")
     run(*build, str(tmp_path / "site"), cwd=ROOT)
@@ -152,8 +134,7 @@ def test_site_builds_without_a_warning(tmp_path):
     assert all(f"mjrec {name}" in commands for name in COMMANDS)
 
 
-def test_generated_pages_are_complete():
-    """Each public name is in one group, and each known OpenGL message is explained."""
+def test_generated_pages_list_all_names_and_opengl_messages():
     pytest.importorskip("mkdocs", reason="the documentation's tools are not here")
     pages = runpy.run_path(str(ROOT / "scripts" / "docs_pages.py"))
     listed = [name for names in pages["GROUPS"].values() for name in names.split()]
@@ -164,8 +145,7 @@ def test_generated_pages_are_complete():
     assert all(f"`{message}`" in text for _, message in pages["GL_MESSAGES"])
 
 
-def test_system_packages_are_those_that_setup_installs():
-    """The apt line of the headless page names what scripts/setup looks for."""
+def test_headless_page_lists_packages_of_setup():
     text = (DOCS / "howto" / "headless.md").read_text()
     [line] = [x for x in text.splitlines() if x.startswith("apt-get install -y libegl")]
     packages = [word for word in line.split() if word.startswith("lib")]
@@ -173,8 +153,7 @@ def test_system_packages_are_those_that_setup_installs():
     assert all(package in SETUP for package in packages)
 
 
-def test_guarantees_are_listed_with_the_engines_that_are_tested():
-    """The page on clusters has a row for each test of engines, in their order."""
+def test_clusters_page_lists_tested_guarantees_in_order():
     tested = []
     for name, test in vars(test_engines).items():
         for mark in getattr(test, "pytestmark", ()):
@@ -193,8 +172,7 @@ def test_guarantees_are_listed_with_the_engines_that_are_tested():
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_dm_control_page_runs(tmp_path):
-    """Its program runs as it stands, and leaves a video of a named environment."""
+def test_program_of_the_dm_control_page_runs(tmp_path):
     needs_extras("dm_control")
     [code] = blocks((DOCS / "howto" / "dm-control.md").read_text(), "python")
     run(sys.executable, "-c", code, cwd=tmp_path)
@@ -203,24 +181,14 @@ def test_dm_control_page_runs(tmp_path):
     assert results["env_info"]["env_id"] == "dm_control/cheetah-run"
 
 
-# --- Examples ---------------------------------------------------------------------
+def example_case(path):
+    is_training = path.stem == "stable_baselines3_training"
+    marker = "stable_baselines3" if is_training else "thorough"
+    return pytest.param(path, id=path.stem, marks=getattr(pytest.mark, marker))
 
 
-@pytest.mark.parametrize(
-    "example",
-    [
-        pytest.param(
-            path,
-            id=path.stem,
-            marks=pytest.mark.stable_baselines3
-            if path.stem == "stable_baselines3_training"
-            else pytest.mark.thorough,
-        )
-        for path in EXAMPLES
-    ],
-)
-def test_example_runs(example, tmp_path):
-    """By itself, in an empty directory, and is listed on the examples' page."""
+@pytest.mark.parametrize("example", [*map(example_case, EXAMPLES)])
+def test_example_runs_alone_and_is_listed(example, tmp_path):
     needs_extras(example.read_text())
     run(sys.executable, shutil.copy(example, tmp_path), cwd=tmp_path)
     assert list((tmp_path / "recordings").iterdir())
@@ -228,8 +196,7 @@ def test_example_runs(example, tmp_path):
 
 
 @pytest.mark.thorough
-def test_command_line_example_runs(tmp_path):
-    """It keeps as many videos as it says, and lists its episodes."""
+def test_shell_example_runs_and_is_listed(tmp_path):
     script = ROOT / "examples" / "command_line" / "evaluate.sh"
     out = run(str(script), str(tmp_path / "out"), cwd=tmp_path)
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 2
@@ -239,8 +206,8 @@ def test_command_line_example_runs(tmp_path):
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_workflow_records_and_uploads(tmp_path):
-    """Its own commands leave what it uploads; the rest is what setup installs too."""
+def test_workflow_records_what_it_uploads(tmp_path):
+    """It installs packages and extras that exist."""
     workflow = yaml.safe_load((ROOT / "examples" / "ci" / "record.yml").read_text())
     [job] = workflow["jobs"].values()
     commands = [step["run"] for step in job["steps"] if "run" in step]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec doctor`: what it says, to people and to scripts, and its exit status."""
+"""`mjrec doctor`: its text, its JSON and its exit status."""
 
 import dataclasses
 import importlib.metadata
@@ -27,6 +27,7 @@ from mjrec.machine_report import (
 )
 
 _PATH = "/opt/" + "a-long-path/" * 8 + "ffmpeg"
+_RAY = 'python -m pip install "mjrec[ray]"'
 _APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
@@ -37,14 +38,12 @@ def run_doctor(*arguments, **variables):
         [sys.executable, "-P", "-m", "mjrec", "doctor", *arguments],
         env={**environ, **variables},
         capture_output=True,
-        check=False,
         text=True,
     )
 
 
-# Takes more than five seconds: each backend draws in a process of its own.
-def test_a_machine_that_renders():
-    """Status 0; what scripts may rely on is there, and what people need to go on."""
+# Takes more than five seconds: each backend draws in its own process.
+def test_json_describes_a_machine_that_renders():
     healthy = run_doctor("--json")
     assert healthy.returncode == 0, healthy.stderr
     facts = json.loads(healthy.stdout)
@@ -53,12 +52,13 @@ def test_a_machine_that_renders():
     [note] = facts["problems"]
     assert "MUJOCO_GL is not set" in note["cause"]
     assert "export MUJOCO_GL=egl" in note["fix"]
-    by_name = {tried["backend"]: tried for tried in facts["backends"]}
-    assert list(by_name) == ["egl", "osmesa", "glfw"]
-    assert by_name["egl"]["frames_per_second"] > 0
-    assert by_name["egl"]["gl_renderer"]
-    assert "DISPLAY is not set" in by_name["glfw"]["cause"]
-    assert by_name["glfw"]["fix"]
+    egl, osmesa, glfw = facts["backends"]
+    names = [backend["backend"] for backend in (egl, osmesa, glfw)]
+    assert names == ["egl", "osmesa", "glfw"]
+    assert egl["frames_per_second"] > 0
+    assert egl["gl_renderer"]
+    assert "DISPLAY is not set" in glfw["cause"]
+    assert glfw["fix"]
     assert facts["ffmpeg"]["encodes"] is True
     assert facts["ffmpeg"]["version"].startswith("ffmpeg version")
     assert facts["python"] == platform.python_version()
@@ -68,13 +68,13 @@ def test_a_machine_that_renders():
     extras = {extra["name"]: extra for extra in facts["extras"]}
     assert extras["SciPy"]["version"] == importlib.metadata.version("scipy")
     assert {"Slurm", "Ray", "submitit", "Dask", "report", "GPU"} < extras.keys()
-    # A new key is added here, none is renamed.
+    # Scripts read these keys: add new ones, rename none.
     assert list(facts) == [
         *("can_render", "backend", "reason", "backends", "problems"),
         *("gpu_device_files", "ffmpeg", "packages", "extras", "cpus"),
         *("python", "platform"),
     ]
-    assert list(by_name["egl"]) == [
+    assert list(egl) == [
         *("backend", "renders", "gl_renderer", "gl_vendor", "gl_version"),
         *("frames_per_second", "devices", "cause", "fix", "output"),
     ]
@@ -84,8 +84,7 @@ def test_a_machine_that_renders():
 
 
 @pytest.mark.thorough
-def test_status_1_where_nothing_may_render():
-    """MUJOCO_GL=off: people read why, and what would render."""
+def test_status_is_1_where_rendering_is_off():
     done = run_doctor(MUJOCO_GL="off")
     assert done.returncode == 1
     assert "cannot render" in done.stdout
@@ -94,23 +93,16 @@ def test_status_1_where_nothing_may_render():
     assert "Traceback" not in done.stderr
 
 
-# Of a machine with a bit of everything.
+LLVMPIPE = EglDevice(0, "/dev/dri/renderD128", 3, True, True)
+MESA = {"gl_renderer": "llvmpipe (LLVM 15.0.6)", "gl_version": "4.5 Mesa [22.3.6]"}
+# A machine with a bit of everything.
 REPORT = MachineReport(
     can_render=True,
     backend="egl",
     reason="the first that works",
     backends=(
-        Probe(
-            "egl",
-            renders=True,
-            gl_renderer="llvmpipe (LLVM 15.0.6, 256 bits)",
-            gl_version="4.5 Mesa [22.3.6]",
-            frames_per_second=12.345,
-            devices=(EglDevice(0, "/dev/dri/renderD128", 3, True, True),),
-        ),
-        Probe(
-            "osmesa", False, cause="[bold]It[/bold] is missing.", fix=f"Do:\n  {_APT}"
-        ),
+        Probe("egl", True, frames_per_second=12.345, devices=(LLVMPIPE,), **MESA),
+        Probe("osmesa", False, cause="[bold]It[/bold] is gone.", fix=f"Do:\n  {_APT}"),
     ),
     problems=(Diagnosis("Something is odd.", "Do:\n  export X=1"),),
     gpu_device_files=("/dev/nvidia0",),
@@ -119,10 +111,7 @@ REPORT = MachineReport(
         Package("dm_control", None, fix="To install it:\n  pip install x"),
         Package("mujoco", "9", works=False, cause="It is too new.", fix="Wait."),
     ),
-    extras=(
-        Package("SciPy", "1.14"),
-        Package("Ray", None, fix='python -m pip install "mjrec[ray]"'),
-    ),
+    extras=(Package("SciPy", "1.14"), Package("Ray", None, fix=_RAY)),
     cpus=Cpus(usable=2, present=64, allowed=4, quota=2.5),
     python="3.11.7",
     platform="Linux",
@@ -135,8 +124,8 @@ def shown(report):
     return console.file.getvalue()
 
 
-def test_what_people_see():
-    """Every fact once, brackets no markup, commands never broken."""
+def test_text_has_each_fact_once_and_whole_commands():
+    """Brackets are no markup."""
     text = shown(REPORT)
     lines = [line.rstrip() for line in text.splitlines()]
     assert f"    {_APT}" in lines
@@ -144,12 +133,12 @@ def test_what_people_see():
     reason = "Nothing renders.\negl: why"
     none = dataclasses.replace(REPORT, backend=None, reason=reason)
     assert "egl: why" not in shown(none)
-    for said in (
+    for words in (
         "12.3 frames per second",
-        "llvmpipe (LLVM 15.0.6, 256 bits), on the CPU",
+        "llvmpipe (LLVM 15.0.6), on the CPU",
         "4.5 Mesa [22.3.6]",
         "EGL device 0: the CPU, /dev/dri/renderD128, CUDA device 3, used",
-        "Cause: [bold]It[/bold] is missing.",
+        "Cause: [bold]It[/bold] is gone.",
         "uses egl (the first that works)",
         "Something is odd.",
         "not installed",
@@ -157,32 +146,31 @@ def test_what_people_see():
         "2 usable (4 of 64 allowed, a quota of 2.5)",
         "/dev/nvidia0",
         "SciPy       1.14",
-        'python -m pip install "mjrec[ray]"',
+        _RAY,
     ):
-        assert said in text
+        assert words in text
 
 
 @pytest.mark.parametrize(
-    ("refused", "said"),
+    ("refused", "message"),
     [
         ("libx264", "Unknown encoder 'libx264'"),
-        # H.264 alone is not enough: what a recording asks for is tried.
+        # It tries the options of recordings, not only H.264.
         ("cpu-independent=1", "Error parsing option cpu-independent"),
     ],
 )
-def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
-    """It is found out, in its own words; what is no ffmpeg is named."""
+def test_unusable_ffmpeg_has_cause_and_fix(refused, message, tmp_path, monkeypatch):
     good = examine_ffmpeg()
     assert good.encodes
     fake = tmp_path / "ffmpeg"
     fake.write_text(
         f'#!/bin/sh\nfor argument do\n  [ "$argument" = {refused} ] && '
-        f'{{ echo "{said}" >&2; exit 8; }}\ndone\nexec {good.path} "$@"\n'
+        f'{{ echo "{message}" >&2; exit 8; }}\ndone\nexec {good.path} "$@"\n'
     )
     fake.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
     found = examine_ffmpeg()
-    assert (found.version, found.encodes, found.cause) == (good.version, False, said)
+    assert (found.version, found.encodes, found.cause) == (good.version, False, message)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     found = examine_ffmpeg()
     assert (found.path, found.encodes) == ("/bin/false", False)
@@ -194,8 +182,7 @@ def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
     ("program", "cause", "fix"),
     [
         (
-            "raise AttributeError(\"'MjModel' object has no attribute "
-            "'flex_vertedge'\")",
+            "raise AttributeError(\"'MjModel' has no attribute 'flex_vertedge'\")",
             "does not support MuJoCo 4",
             'pip install "mujoco<4"',
         ),
@@ -203,8 +190,8 @@ def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
         ("import ctypes; ctypes.string_at(0)", "status -11", "pip install y"),
     ],
 )
-def test_a_package_that_does_not_work(program, cause, fix):
-    """A failure in a child process has a cause and a fix; even a crash."""
+def test_failing_package_has_a_cause_and_a_fix(program, cause, fix):
+    """Even if its import crashes."""
     lacking = examine_package("mjrec-there-is-no-such", "import nothing", "pip get x")
     assert (lacking.version, lacking.works) == (None, None)
     assert "pip get x" in lacking.fix

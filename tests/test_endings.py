@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an environment raises goes on unchanged, and the recording says it."""
+"""Recordings say how they ended, and exceptions pass unchanged."""
 
 import signal
 
@@ -14,7 +14,7 @@ from mjrec.recorder.endings import ending
 
 
 class Breaking(gymnasium.Wrapper):
-    """Raises `error` in the step, or at the reset, that is its turn."""
+    """Raises `error` in the next step or reset."""
 
     error = None
 
@@ -39,7 +39,7 @@ def pendulum(steps=None):
 
 @pytest.fixture(params=["live", "deferred"])
 def monitored(request, tmp_path):
-    """A pendulum that breaks on demand, and its monitor."""
+    """Return a pendulum that raises on demand, and its monitor."""
     env = Breaking(pendulum())
     options = {"render": request.param, "workers": 1, "allow_early_reset": True}
     return env, Monitor(env, tmp_path, lambda _: True, **options)
@@ -50,10 +50,8 @@ def steps(monitor, count):
         monitor.step(monitor.action_space.sample() * 0)
 
 
-def test_a_step_that_raises_ends_its_episode_unless_another_one_follows(
-    monitored, tmp_path
-):
-    """What was captured is kept and marked; the exception is the environment's own."""
+def test_failing_step_ends_its_episode_unless_it_goes_on(monitored, tmp_path):
+    """The video keeps its frames and the exception."""
     env, monitor = monitored
     for seed in range(2):
         monitor.reset(seed=seed)
@@ -62,21 +60,18 @@ def test_a_step_that_raises_ends_its_episode_unless_another_one_follows(
         with pytest.raises(ValueError, match="unstable") as caught:
             steps(monitor, 1)
         assert caught.value is error
-    # This one goes on, and nothing is wrong with it.
+    # The second episode goes on, so nothing is wrong with it.
     steps(monitor, 2)
     monitor.close()
     metadata = metadata_of(tmp_path, 0)
     assert (metadata["complete"], metadata["reason"]) == (False, "exception")
-    assert metadata["exception"] == {
-        "type": "ValueError",
-        "message": "the simulation is unstable",
-    }
+    exception = {"type": "ValueError", "message": "the simulation is unstable"}
+    assert metadata["exception"] == exception
     assert metadata_of(tmp_path, 1)["reason"] == "close"
     assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [3, 5]
 
 
-def test_reset_that_raises(monitored, tmp_path):
-    """The episode before it, if one was not over, is marked with that."""
+def test_failing_reset_marks_the_unfinished_episode(monitored, tmp_path):
     env, monitor = monitored
     for _ in range(2):
         env.error = RuntimeError("no such level")
@@ -93,9 +88,7 @@ def test_reset_that_raises(monitored, tmp_path):
     assert len(frames_in(tmp_path, 0)) == 3
 
 
-def test_an_exception_that_has_no_text_or_much():
-    """Its own __str__ may be what is broken; a message has a bounded length."""
-
+def test_exception_messages_may_fail_and_are_shortened():
     class Mute(Exception):
         def __str__(self):
             raise RuntimeError
@@ -130,7 +123,7 @@ for seed in range(2):
         ("raise OverflowError('too far')", 1, "exception"),
         ("sys.exit(7)", 7, "close"),
         ("", 0, "close"),
-        # Python ignores what finalisers raise, and there is no second SIGTERM.
+        # Python ignores exceptions of finalizers, and no second SIGTERM comes.
         (
             "class Last:\n"
             "    def __del__(self): os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -140,8 +133,8 @@ for seed in range(2):
         ),
     ],
 )
-def test_ways_of_ending_a_program(code, status, reason, tmp_path):
-    """Without `with`, every file is closed and named, nothing is rendered, and said."""
+def test_program_closes_its_files_however_it_ends(code, status, reason, tmp_path):
+    """It renders nothing, and names the pending videos."""
     done = run_python(PROGRAM + code, tmp_path, status=status)
     assert done.stderr.count("2 videos pending: mjrec render") == 1
     assert len(stats_of(tmp_path)["episode_lengths"]) == 1
@@ -154,16 +147,15 @@ def test_ways_of_ending_a_program(code, status, reason, tmp_path):
         assert facts["exception"]["message"] == "too far"
 
 
-def test_a_full_disk_at_exit_is_one_line(tmp_path):
-    """No traceback of the interpreter's exit hooks, in which the reason would drown."""
+def test_full_disk_at_exit_prints_no_traceback(tmp_path):
     code = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
     done = run_python(PROGRAM + code, tmp_path, status=0)
     assert "File too large" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
-    """`nohup` asks for it; a SIGTERM closes the files all the same."""
+def test_ignored_hangup_stays_ignored(tmp_path):
+    """`nohup` asks for it; SIGTERM still closes the files."""
     code = (
         "os.kill(os.getpid(), signal.SIGHUP)\n"
         "print('still here', flush=True)\n"
@@ -179,16 +171,14 @@ def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
 @pytest.mark.parametrize(
     "moment", ["states.StateRecorder.end", "recorder.Recorder._end_episode"]
 )
-def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch):
-    """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
+def test_episode_interrupted_at_its_end_is_recovered(moment, tmp_path, monkeypatch):
+    """Ctrl-C comes while its end is recorded."""
     monitor = Monitor(pendulum(3), tmp_path, lambda _: True, workers=0)
     monitor.reset(seed=0)
     steps(monitor, 2)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            f"mjrec.recorder.{moment}",
-            lambda *_, **__: signal.raise_signal(signal.SIGINT),
-        )
+        interrupt = lambda *_, **__: signal.raise_signal(signal.SIGINT)  # noqa: E731
+        patch.setattr(f"mjrec.recorder.{moment}", interrupt)
         with pytest.raises(KeyboardInterrupt):
             steps(monitor, 1)
     monitor.reset(seed=0)

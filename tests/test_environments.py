@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From names to environments; Gymnasium's."""
+"""Environments from names, and Gymnasium's own."""
 
 import sys
 
@@ -10,6 +10,7 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
 import mjrec
 from conftest import Corridor
+from mjrec import InvalidArgument
 from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
 from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.gymnasium_environments import make_gymnasium
@@ -31,11 +32,8 @@ def named(name, **options):
     return environment_from_name(name, EnvironmentOptions(**options))
 
 
-# --- Seeds ------------------------------------------------------------------------
-
-
 def trajectory(made, seeds, *, steps=10):
-    """Return the observations of an episode's first steps under random actions."""
+    """Return the observations of an episode's first steps with random actions."""
     policy = load_policy("random", made.environment)
     policy.reset(seeds)
     observations = [made.begin_episode(made.environment, seeds)]
@@ -49,8 +47,8 @@ def trajectory(made, seeds, *, steps=10):
 @pytest.mark.parametrize(
     "name", ["HalfCheetah-v5", "dm_control/cheetah-run", "A B.MJCF"]
 )
-def test_an_episode_depends_on_its_seeds_alone(name, tmp_path, monkeypatch):
-    """Neither on the episodes before it nor on how these ended."""
+def test_episode_depends_only_on_its_seeds(name, tmp_path, monkeypatch):
+    """Earlier episodes make no difference."""
     if name.startswith("dm_control/"):
         pytest.importorskip("dm_control")
     monkeypatch.chdir(tmp_path)
@@ -63,22 +61,21 @@ def test_an_episode_depends_on_its_seeds_alone(name, tmp_path, monkeypatch):
     assert trajectory(made, episode_seeds(6, 3)) != first
 
 
-def test_the_environments_seed_and_the_actions_seed_differ():
-    """Each stream changes what it is for, and nothing else."""
+def test_environment_and_actions_have_separate_seeds():
     made = named("HalfCheetah-v5", frames=False)
     seeds = EpisodeSeeds(environment=1, actions=2, policy=3)
     same_start = EpisodeSeeds(environment=1, actions=4, policy=3)
     begun, drawn = [], []
     for each in (seeds, seeds, same_start):
         begun.append(made.begin_episode(made.environment, each).tolist())
-        # A policy of the user's may draw from the action space, too.
+        # A user's policy may sample the action space too.
         drawn.append(made.environment.action_space.sample().tolist())
     assert begun[0] == begun[1] == begun[2]
     assert drawn[0] == drawn[1] != drawn[2]
 
 
-def test_a_stream_is_seeded_once():
-    """As Gymnasium's users do: `reset(seed=...)`, then `reset()` and `reset()`."""
+def test_begin_seeds_once_as_gymnasium_users_do():
+    """They call `reset(seed=...)`, then `reset()` and `reset()`."""
     made = named("InvertedPendulum-v5", frames=False)
     theirs = gymnasium.make("InvertedPendulum-v5")
     expected = [theirs.reset(seed=4)[0], theirs.reset()[0]]
@@ -87,29 +84,22 @@ def test_a_stream_is_seeded_once():
     assert np.array_equal(found, expected)
 
 
-def test_seeds_stay_what_they_were():
-    """Recordings of other years must be repeatable: the numbers are part of them."""
+def test_seeds_never_change_between_versions():
     assert episode_seeds(0, 1) == EpisodeSeeds(
         environment=1982462498, actions=679461430, policy=1947452081
     )
 
 
 @pytest.mark.parametrize("bad", [-1, 2**32, True])
-def test_what_is_no_seed_is_refused(bad):
-    """The message names the argument and says what it may be."""
-    with pytest.raises(mjrec.InvalidArgument, match=r"seed must be .*4294967295"):
+def test_invalid_seeds_are_rejected(bad):
+    with pytest.raises(InvalidArgument, match=r"seed must be .*4294967295"):
         episode_seeds(bad, 0)
-    with pytest.raises(mjrec.InvalidArgument, match="episode must be"):
+    with pytest.raises(InvalidArgument, match="episode must be"):
         episode_seeds(0, bad)
 
 
-# --- Names ------------------------------------------------------------------------
-
-
-def test_a_module_that_registers_lies_in_the_working_directory(
-    tmp_path, monkeypatch, registered
-):
-    """`module:Id` imports it first; that it fails is one error."""
+def test_module_may_be_in_the_working_directory(tmp_path, monkeypatch, registered):
+    """`module:Id` imports it first, and a failing import is one error."""
     (tmp_path / "mjrec_test_envs.py").write_text(
         "import gymnasium, conftest\n"
         "gymnasium.register('Local-v0', lambda **k: conftest.Corridor(**k))\n"
@@ -121,9 +111,6 @@ def test_a_module_that_registers_lies_in_the_working_directory(
     with pytest.raises(mjrec.EnvironmentNotMade, match="ZeroDivisionError"):
         make("mjrec_test_broken:Local-v0")
     assert sys.path == path
-
-
-# --- Environments of users --------------------------------------------------------
 
 
 class OnlyText(Corridor):
@@ -158,7 +145,7 @@ def registered(monkeypatch):
         "OnlyText-v0": OnlyText,
         "OnlyWindow-v0": OnlyWindow,
         "NoCamera-v0": NoCamera,
-        # Its render modes are known only when it has been called.
+        # Its render modes are unknown until it is called.
         "Made-v0": lambda render_mode=None: Corridor(render_mode=render_mode),
         "Blind-v0": lambda render_mode=None: Corridor(render_mode=None),
         "Missing-v0": missing,
@@ -173,30 +160,29 @@ def registered(monkeypatch):
         ("Corridor-v0", None, {}, 1000),
         ("Corridor-v0", 3, {}, 3),
         ("Short-v0", 9, {}, 4),
-        # Gymnasium's own word for it; -1 is none.
+        # Gymnasium's own name for it, with -1 for no limit.
         ("HalfCheetah-v5", None, {"max_episode_steps": 6}, 6),
         ("Short-v0", None, {"max_episode_steps": -1}, 1000),
     ],
 )
-def test_limits(registered, env_id, asked, kwargs, expected):
-    """1000 where an environment has none; its own where that is smaller."""
+def test_step_limit_is_smallest_or_1000(registered, env_id, asked, kwargs, expected):
     env = make(env_id, max_steps=asked, kwargs=kwargs)
     assert env.spec.max_episode_steps == expected
 
 
 @pytest.mark.parametrize(
-    ("env_id", "mode"), [("OnlyText-v0", "ansi"), ("Made-v0", "rgb_array")]
+    ("env_id", "kwargs", "mode", "text"),
+    [
+        *(("OnlyText-v0", {}, "ansi", "o\n"), ("Made-v0", {}, "rgb_array", "")),
+        # A name without a version means the latest.
+        ("FrozenLake", {"render_mode": "ansi"}, "ansi", "FHFH"),
+    ],
 )
-def test_the_render_mode_is_one_that_the_environment_has(registered, env_id, mode):
-    """Text where it has nothing else."""
-    assert make(env_id).render_mode == mode
-
-
-def test_text_that_is_asked_for_is_drawn():
-    """Though the environment has frames, too; without a version the latest is meant."""
-    env = make("FrozenLake", kwargs={"render_mode": "ansi"})
+def test_render_mode_is_requested_or_available(registered, env_id, kwargs, mode, text):
+    env = make(env_id, kwargs=kwargs)
     env.reset(seed=0)
-    assert "FHFH" in str(env.render())
+    assert env.render_mode == mode
+    assert text in str(env.render())
 
 
 @pytest.mark.parametrize(
@@ -205,73 +191,63 @@ def test_text_that_is_asked_for_is_drawn():
         ("HalfCheetah-v5", {}, "track"),
         ("HalfCheetah-v5", {"camera": -1}, -1),
         ("HalfCheetah-v5", {"kwargs": {"camera_id": -1}}, -1),
-        # It takes no camera, as Gymnasium-Robotics' do.
+        # It takes no camera, like those of Gymnasium-Robotics.
         ("NoCamera-v0", {}, "track"),
     ],
 )
-def test_frames_follow_the_robot_unless_asked_otherwise(
-    registered, env_id, options, camera
-):
-    """Gymnasium 1.4's default camera, -1, stays where it is."""
+def test_default_camera_follows_the_robot(registered, env_id, options, camera):
+    """Gymnasium 1.4's default camera, -1, does not."""
     base = make(env_id, **options).unwrapped
     shown = base.mujoco_renderer.camera_id
     assert camera == (-1 if shown == -1 else base.model.camera(shown).name)
 
 
-# --- What cannot be ---------------------------------------------------------------
-
 CHEETAH = "HalfCheetah-v5"
 WRONG = [
-    (" ", {}, mjrec.InvalidArgument, "name must be"),
-    ("dm_control/cheetah", {}, mjrec.InvalidArgument, "dm_control/<domain>-<task>"),
-    ("./robot.txt", {}, mjrec.InvalidArgument, r"\.xml or \.mjcf"),
+    (" ", {}, InvalidArgument, "name must be"),
+    ("dm_control/cheetah", {}, InvalidArgument, "dm_control/<domain>-<task>"),
+    ("./robot.txt", {}, InvalidArgument, r"\.xml or \.mjcf"),
     ("robto.xml", {}, mjrec.UnknownName, r"MJCF file .*Available: .*robot.xml"),
-    # Nobody remembers every version; unlike any, how names are made.
+    # Similar names ignore versions; without any, the error explains names.
     ("halfcheeta-v9", {}, mjrec.UnknownName, CHEETAH),
     ("zz/zzz-v0", {}, mjrec.UnknownName, r"colon.*dm_control/<domain>"),
     ("no_such_module:X-v0", {}, mjrec.EnvironmentNotMade, "no_such_module"),
-    # Of what a constructor raises there is one error.
+    # Errors of a constructor become one error.
     (CHEETAH, {"kwargs": {"foo": 1}}, mjrec.EnvironmentNotMade, f"{CHEETAH}.*'foo'"),
     # Gymnasium's own message has the commands between backticks.
     (
         *("Missing-v0", {}, mjrec.MissingDependency),
         r"Missing-v0 needs no_such_engine.*install swig && pip install engine",
     ),
-    (CHEETAH, {"kwargs": {"max_episode_steps": 1.5}}, mjrec.InvalidArgument, "max_ep"),
-    (
-        CHEETAH,
-        {"camera": 0, "kwargs": {"camera_id": 0}},
-        mjrec.InvalidArgument,
-        "twice",
-    ),
-    (CHEETAH, {"width": 9, "kwargs": {"width": 8}}, mjrec.InvalidArgument, "twice"),
+    (CHEETAH, {"kwargs": {"max_episode_steps": 1.5}}, InvalidArgument, "max_ep"),
+    (CHEETAH, {"camera": 0, "kwargs": {"camera_id": 0}}, InvalidArgument, "twice"),
+    (CHEETAH, {"width": 9, "kwargs": {"width": 8}}, InvalidArgument, "twice"),
     (CHEETAH, {"camera": "nose"}, mjrec.UnknownName, "'nose'.*track"),
-    (CHEETAH, {"camera": 3}, mjrec.InvalidArgument, "Camera number 3"),
-    ("Corridor-v0", {"camera": "track"}, mjrec.InvalidArgument, "has no cameras"),
-    ("Corridor-v0", {"height": 9, "width": 9}, mjrec.InvalidArgument, "takes no size"),
+    (CHEETAH, {"camera": 3}, InvalidArgument, "Camera number 3"),
+    ("Corridor-v0", {"camera": "track"}, InvalidArgument, "has no cameras"),
+    ("Corridor-v0", {"height": 9, "width": 9}, InvalidArgument, "takes no size"),
     # The modes there are, the modes it takes, and the way out.
     ("OnlyWindow-v0", {}, mjrec.NoPictures, r"\['human'\].*rgb_array.*none"),
     ("Blind-v0", {}, mjrec.NoPictures, "ignored render_mode"),
     (CHEETAH, {"kwargs": {"render_mode": None}}, mjrec.NoPictures, "was requested"),
     (CHEETAH, {"kwargs": {"render_mode": "rgb"}}, mjrec.UnknownName, "'rgb'.*rgb_arr"),
-    *(
-        (CHEETAH, {name: bad}, mjrec.InvalidArgument, name)
-        for name, bad in (("max_steps", 0), ("max_steps", 1.5), ("height", True))
-    ),
+    (CHEETAH, {"max_steps": 0}, InvalidArgument, "max_steps"),
+    (CHEETAH, {"max_steps": 1.5}, InvalidArgument, "max_steps"),
+    (CHEETAH, {"height": True}, InvalidArgument, "height"),
 ]
 
 
 @pytest.mark.parametrize(("name", "options", "kind", "words"), WRONG)
-def test_what_cannot_be_says_what_can(
+def test_invalid_requests_name_the_valid_ones(
     tmp_path, monkeypatch, registered, name, options, kind, words
 ):
-    """As the error that it is, before any episode begins."""
+    """They fail before any episode begins."""
     monkeypatch.chdir(tmp_path)
     for file_name in ("robot.txt", "robot.xml"):
         (tmp_path / file_name).write_text("<mujoco/>")
 
     def begin():
-        # Some are made all the same, without frames.
+        # Some environments are made without frames.
         if (refusal := named(name, **options).not_drawn) is not None:
             raise refusal
 
@@ -280,8 +256,8 @@ def test_what_cannot_be_says_what_can(
     assert "foo" not in words or isinstance(caught.value.__cause__, TypeError)
 
 
-def test_without_pygame_drawing_is_refused_before_the_first_episode(monkeypatch):
-    """The line to run; and text, where the environment has it."""
+def test_missing_pygame_is_reported_before_the_first_episode(monkeypatch):
+    """The error has the command, and names text where the environment has it."""
     monkeypatch.setitem(sys.modules, "pygame", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(mjrec.MissingDependency, match=r"gymnasium\[classic-control\]"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dm_control's environments by their names."""
+"""dm_control's environments from names."""
 
 import numpy as np
 import pytest
@@ -19,13 +19,13 @@ from mjrec.environments.named_environment import is_terminated, is_truncated
 
 
 def named(task, **options):
-    """Return a task by its name, without frames unless they are asked for."""
+    """Return a task by its name, by default without frames."""
     made = EnvironmentOptions(**{"frames": False, **options})
     return environment_from_name(f"dm_control/{task}", made)
 
 
-def test_a_task_is_made_with_its_own_limit():
-    """All but lqr have one; max_steps lowers it; lqr gets 1000."""
+def test_step_limit_is_smallest_or_1000():
+    """All tasks but lqr have their own."""
     assert named("pendulum-swingup", max_steps=5000).step_limit == 1000
     assert named("pendulum-swingup", max_steps=5).step_limit == 5
     assert named("lqr-lqr_2_1").step_limit == 1000
@@ -39,8 +39,8 @@ def test_a_task_is_made_with_its_own_limit():
     assert steps[-1].reward is not None
 
 
-def test_the_run_seeds_what_is_drawn_when_a_task_is_made():
-    """The springs of lqr are part of its model."""
+def test_seed_determines_random_parts_of_models():
+    """The task lqr draws its springs when it is made."""
 
     def springs(seed, **kwargs):
         env = named("lqr-lqr_2_1", seed=seed, kwargs=kwargs).environment
@@ -50,18 +50,15 @@ def test_the_run_seeds_what_is_drawn_when_a_task_is_made():
     assert springs(1, task_kwargs={"random": 2}) == springs(2)
 
 
-def test_a_monitor_is_told_the_seed(tmp_path):
-    """dm_env's reset takes none that it could see."""
+def test_monitor_knows_the_seed(tmp_path):
+    """dm_env's reset takes none."""
     made = named("ball_in_cup-catch")
-    with mjrec.Monitor(
-        made.environment, tmp_path, video_callable=False, env_id="x"
-    ) as monitor:
+    with mjrec.Monitor(made.environment, tmp_path, False, env_id="x") as monitor:
         made.begin_episode(monitor, episode_seeds(0, 0))
         assert monitor.seed == episode_seeds(0, 0).environment
 
 
-def test_arguments_reach_the_task_and_the_environment():
-    """In suite.load's own form."""
+def test_arguments_reach_suite_load():
     kwargs = {
         "task_kwargs": {"time_limit": 1},
         "environment_kwargs": {"flat_observation": True},
@@ -82,8 +79,7 @@ def test_arguments_reach_the_task_and_the_environment():
         ("cheetah-run", {"kwargs": {"task_kwargs": {"q": 1}}}, "cheetah-run.*'q'"),
     ],
 )
-def test_what_cannot_be_says_what_can(task, options, words):
-    """Names that there are, or the form of the arguments, before any episode."""
+def test_invalid_requests_name_the_valid_ones(task, options, words):
     kind = mjrec.EnvironmentNotMade if "'q'" in words else mjrec.UnknownName
     with pytest.raises(kind, match=words):
         named(task, **options)
@@ -99,31 +95,27 @@ def test_what_cannot_be_says_what_can(task, options, words):
         ("cheetah-run", {"frames": False}, {}),
     ],
 )
-def test_the_view_follows_the_robot(task, options, view):
-    """Or is the model's first camera, or what is asked for; none without frames."""
+def test_default_camera_follows_the_robot_or_is_the_first(task, options, view):
     made = named(task, **{"frames": True, **options})
     assert (made.env_id, made.view) == (f"dm_control/{task}", view)
 
 
-def test_without_a_dm_control_that_works_the_line_to_run_is_named(
-    tmp_path, monkeypatch
-):
-    """Whether it is not there, or does not know this mujoco."""
+def test_unusable_dm_control_is_an_error_with_the_fix(tmp_path, monkeypatch):
     (tmp_path / "dm_control.py").write_text(
         "raise ModuleNotFoundError('No module', name='dm_control')"
     )
-    said = run_python(
+    text = run_python(
         "-c",
         "import mjrec.environments.from_name as f\n"
         "try: f.environment_from_name('dm_control/cheetah-run')\n"
         "except Exception as error: print(type(error).__name__, error)\n",
         PYTHONPATH=str(tmp_path),
     )
-    assert said.startswith("MissingDependency dm_control/cheetah-run needs dm_control")
-    assert 'pip install "mjrec[dm-control]"' in said
+    assert text.startswith("MissingDependency dm_control/cheetah-run needs dm_control")
+    assert 'pip install "mjrec[dm-control]"' in text
 
     def load(*_, **__):
-        # What dm_control 1.0.50 does with mujoco 4.0.
+        # As dm_control 1.0.50 does with mujoco 4.0.
         raise AttributeError("'MjModel' object has no attribute 'flex_vertedge'")
 
     monkeypatch.setattr(suite, "load", load)
@@ -131,23 +123,19 @@ def test_without_a_dm_control_that_works_the_line_to_run_is_named(
         named("cheetah-run")
 
 
-def test_a_recording_says_with_what_its_task_was_made():
-    """Also under the limit of ours; of somebody else's environment nobody knows."""
+def test_recorded_arguments_are_those_of_named_tasks():
+    """Those of a user's own environment are unknown."""
     made = {"seed": 5, "max_steps": 3, "kwargs": {"task_kwargs": {"time_limit": 2}}}
-    for env, kwargs in (
-        (
-            named("cartpole-swingup", **made).environment,
-            {"task_kwargs": {"random": 5, "time_limit": 2}},
-        ),
-        (suite.load("cartpole", "swingup"), None),
-    ):
+    ours = named("cartpole-swingup", **made).environment
+    known = {"task_kwargs": {"random": 5, "time_limit": 2}}
+    for env, kwargs in ((ours, known), (suite.load("cartpole", "swingup"), None)):
         recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup")
         assert recorded.environment["kwargs"] == kwargs
 
 
 @pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])
-def test_a_stream_is_what_the_suites_users_have(task):
-    """Seeded once when it is loaded, then reset and reset, as `suite.load` is used."""
+def test_begin_seeds_once_as_users_of_the_suite_do(task):
+    """They seed `suite.load`, then reset and reset."""
     theirs = suite.load(*task.split("-"), task_kwargs={"random": 7})
     made = named(task, seed=7)
     for episode in range(3):
@@ -156,8 +144,8 @@ def test_a_stream_is_what_the_suites_users_have(task):
         np.testing.assert_equal(dict(first), dict(theirs.reset().observation))
 
 
-def test_a_stream_of_another_seed_is_begun_anew():
-    """What the environment was made with does not matter then, nor what it drew."""
+def test_another_seed_begins_anew():
+    """The environment's own seed and earlier episodes make no difference."""
     fresh, used = (named("pendulum-swingup", seed=7) for _ in range(2))
     used.environment.reset()
     seeds = episode_seeds(9, 0)

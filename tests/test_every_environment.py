@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors of every environment there is."""
+"""Monitors record every environment."""
 
 import importlib.util
 from fractions import Fraction
@@ -28,7 +28,7 @@ def suite_tasks():
 
 
 def check(name, directory, timestep):
-    """Record an episode, which plays in real time and has something to see."""
+    """Record an episode, whose video plays in real time and is not blank."""
     made = EnvironmentOptions(max_steps=3, height=48, width=64)
     session = Session(environment=name, directory=directory, seed=0, made=made)
     [episode] = record_session(session)
@@ -38,20 +38,15 @@ def check(name, directory, timestep):
     expected = Fraction(timestep).limit_denominator(10**6)
     assert Fraction(metadata["timestep"]) == expected
     assert metadata["playback_speed"] == 1.0
-    # Neither black nor of one colour.
+    # Neither black nor of one color.
     assert all(frame.std() > 5 for frame in frames_in(directory, 0))
-
-
-def test_all_of_gymnasiums_are_known():
-    """The list is not empty by mistake."""
-    assert len(GYMNASIUM) == 11
 
 
 @parametrize(
     "name", GYMNASIUM, default=("HalfCheetah-v5",), part=pytest.mark.environments
 )
-def test_gymnasium(name, tmp_path):
-    """Recorded in real time, with something to see."""
+def test_gymnasium_environment_is_recorded(name, tmp_path):
+    assert len(GYMNASIUM) == 11
     check(name, tmp_path, gymnasium.make(name).unwrapped.dt)
 
 
@@ -62,8 +57,7 @@ def test_gymnasium(name, tmp_path):
     default=("dm_control/cheetah-run",),
     part=pytest.mark.environments,
 )
-def test_dm_control(name, tmp_path):
-    """Recorded in real time, with something to see."""
+def test_dm_control_task_is_recorded(name, tmp_path):
     from dm_control import suite
 
     env = suite.load(*name.removeprefix("dm_control/").split("-"))

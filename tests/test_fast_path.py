@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of which nothing but the state is new are recorded as all others are."""
+"""The recorder's fast path records steps as the usual path does."""
 
 import itertools
 import os
@@ -23,20 +23,14 @@ CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 
 
 def make(env_id=CHEETAH, steps=8, *, give=None):
-    """Return an environment whose steps are usual; `give` changes its rewards."""
+    """Return an environment that allows the fast path; `give` changes its rewards."""
     env = gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
     if give is not None:
         env = gymnasium.wrappers.TransformReward(env, lambda r: give(float(r)))
     return env
 
 
-def is_fast(monitor):
-    """Return whether the coming step may be recorded the fast way."""
-    return monitor._recorder.fast is not None
-
-
 def trajectories(directory):
-    """Return those of all episodes that are over, in their order."""
     return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
 
 
@@ -56,11 +50,11 @@ def begin(monitor):
         monitor.reset()
 
 
-def go(monitor, count, *, usual=True):
-    """Take so many steps, and return what they returned."""
+def go(monitor, count, *, fast=True):
+    """Take steps, without the fast path if asked, and return their results."""
     results = []
     for number in range(1, count + 1):
-        if not usual:
+        if not fast:
             monitor._recorder.fast = None
         if isinstance(monitor, gymnasium.Env):
             action = monitor.action_space.sample()
@@ -72,17 +66,12 @@ def go(monitor, count, *, usual=True):
     return results
 
 
-def recorded(env, directory, **options):
-    """Record an episode of eight steps and return its trajectory."""
-    is_usual = options.pop("usual")
+def recorded(env, directory, *, fast, **options):
     with monitored(env, directory, **options) as monitor:
         begin(monitor)
-        go(monitor, 8, usual=is_usual)
+        go(monitor, 8, fast=fast)
     [trajectory] = trajectories(directory)
     return trajectory
-
-
-# --- what is recorded ----------------------------------------------------------------
 
 
 def dm_control(domain, task, camera, *marks):
@@ -111,26 +100,21 @@ def dm_control(domain, task, camera, *marks):
         dm_control("hopper", "stand", None, pytest.mark.thorough),
     ],
 )
-def test_usual_steps_are_recorded_as_others_are(new, camera, max_fps, frames, tmp_path):
-    """States, actions, rewards, ends and frames are the same, bit for bit."""
+def test_fast_and_full_path_record_the_same(new, camera, max_fps, frames, tmp_path):
     view = {"camera": camera, "max_fps": max_fps}
-    usual, other = (
-        recorded(new(), tmp_path / str(is_usual), usual=is_usual, **view)
-        for is_usual in (True, False)
+    fast, full = (
+        recorded(new(), tmp_path / str(is_fast), fast=is_fast, **view)
+        for is_fast in (True, False)
     )
-    assert len(usual) == 8
-    assert usual.frame_steps.tolist() == frames
-    for name in ("states", "actions", "rewards", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(usual, name), getattr(other, name))
-    np.testing.assert_array_equal(usual.frame_steps, other.frame_steps)
-    assert usual.snapshots.keys() == other.snapshots.keys()
-    for name, values in other.snapshots.items():
-        np.testing.assert_array_equal(usual.snapshots[name], values)
+    assert len(fast) == 8
+    assert fast.frame_steps.tolist() == frames
+    ends = ("terminated", "truncated", "frame_steps")
+    for name in ("states", "actions", "rewards", *ends):
+        np.testing.assert_array_equal(getattr(fast, name), getattr(full, name))
+    np.testing.assert_equal(fast.snapshots, full.snapshots)
 
 
-def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
-    """Another action and another pace: the reset is written anew, or they are noted."""
-
+def test_action_shape_and_timestep_may_change_between_episodes(tmp_path):
     class Other(gymnasium.Wrapper):
         def reset(self, **options):
             result = self.env.reset(**options)
@@ -161,20 +145,20 @@ def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
         np.float32,
         np.array,
         lambda reward: np.array([reward]),
-        # Another one in mid-episode.
+        # The type changes within an episode.
         lambda reward: reward > 0 if reward > 0 else np.float64(reward),
     ],
     ids=["int", "float32", "0-d", "1-d", "mixed"],
 )
-def test_rewards_of_any_type_are_numbers(kind, schedule, tmp_path):
-    """In the trajectory and, added up in their order, in the statistics."""
+def test_rewards_of_any_type_become_floats(kind, schedule, tmp_path):
+    """Trajectories have each, and statistics their sum in order."""
     with monitored(make(give=kind), tmp_path, schedule) as monitor:
         begin(monitor)
         stats, rewards = monitor.stats_recorder, []
         for number in range(1, 9):
             [(_, reward, *_)] = go(monitor, 1)
             rewards.append(float(np.asarray(reward).item()))
-            # Up to date after every step, and no number of NumPy's.
+            # Statistics are up to date after every step, as Python's floats.
             assert (stats.steps, stats.total_steps) == (number, number)
             assert (stats.rewards, type(stats.rewards)) == (added_up(rewards), float)
         [total] = monitor.get_episode_rewards()
@@ -184,8 +168,8 @@ def test_rewards_of_any_type_are_numbers(kind, schedule, tmp_path):
     assert stats_of(tmp_path)["episode_rewards"] == [total]
 
 
-def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
-    """The next one is; a monitor that is closed within a step returns it as ever."""
+def test_step_with_an_invalid_reward_is_not_recorded(tmp_path):
+    """The next step is, and a monitor closed within a step returns its result."""
     rewards = iter([1.0, 1.0, "much", 1.0])
 
     def give(reward):
@@ -201,7 +185,7 @@ def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
         go(monitor, 1)
     go(monitor, 1)
     last = env.unwrapped.data.qpos.copy()
-    assert is_fast(monitor)
+    assert monitor._recorder.fast is not None
     [(observation, *_)] = go(monitor, 1)
     assert observation.shape == (17,)
     [trajectory] = trajectories(tmp_path)
@@ -209,8 +193,8 @@ def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
     assert trajectory.rewards.tolist() == [1.0] * 3
 
 
-def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
-    """Of any type in mid-episode, also where the environment overwrites them."""
+def test_actions_are_recorded_as_given(tmp_path, caplog):
+    """Types may change, and the environment may overwrite them."""
 
     class Overwriting(gymnasium.Wrapper):
         def step(self, action):
@@ -228,7 +212,7 @@ def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
         np.linspace(-1, 1, 6).astype(">f4"),
         np.linspace(-1, 1, 12, dtype=np.float32)[::2],
     ]
-    # Also where the first are whole numbers.
+    # The first action has integers.
     actions = [other[3], *itertools.chain(*zip(usual, other, strict=True))]
     expected = np.array(actions, np.float64)
     with monitored(Overwriting(make(steps=len(actions))), tmp_path) as monitor:
@@ -240,16 +224,9 @@ def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
     assert "different type or shape" not in caplog.text
 
 
-# --- errors, and the end -------------------------------------------------------------
-
-
-def interrupt_in(monitor, event_number):
-    """Take a step, and raise behind one of the calls in it, as a signal's handler does.
-
-    Returns:
-        Whether there were so many calls.
-    """
-    left = event_number
+def interrupt_in(monitor, call_number):
+    """Take a step and raise after a call in mjrec; return whether it came so far."""
+    left = call_number
 
     def profile(frame, event, _):
         nonlocal left
@@ -268,14 +245,13 @@ def interrupt_in(monitor, event_number):
     return False
 
 
-# Takes more than five seconds: an episode for each place of an interruption.
+# Takes more than five seconds: it records an episode per place of an interruption.
 @pytest.mark.parametrize(
     ("max_fps", "schedule"),
     [(None, None), (8, None), (None, False)],
     ids=["frames", "few frames", "counted"],
 )
-def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
-    """Wherever it is interrupted, who goes on has statistics and rows of all others."""
+def test_interrupted_step_is_recorded_whole_or_not_at_all(max_fps, schedule, tmp_path):
     was_interrupted, number = True, 0
     while was_interrupted:
         number += 1
@@ -283,7 +259,7 @@ def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
         with monitored(make(), directory, schedule, max_fps=max_fps) as monitor:
             begin(monitor)
             go(monitor, 4)
-            assert is_fast(monitor)
+            assert monitor._recorder.fast is not None
             was_interrupted = interrupt_in(monitor, number)
             while not monitor.stats_recorder.done:
                 go(monitor, 1)
@@ -303,9 +279,7 @@ def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("moment", ["being filled", "filled"])
-def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
-    """Between filling it and counting it, too: all rows before it are there."""
-
+def test_kill_while_writing_a_row_loses_only_that_row(moment, tmp_path):
     def record(_):
         rows = itertools.count(1)
         words = fast_path.WORDS
@@ -327,6 +301,6 @@ def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     _, status = forked(record)
     assert os.WTERMSIG(status) == signal.SIGKILL
     mjrec.recover(tmp_path)
-    # The first step of all did not go the fast way.
+    # The first step does not use the fast path.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]
     assert [each.complete for each in trajectories(tmp_path)] == [True, True, False]

@@ -29,8 +29,7 @@ def script(path, text):
     return path
 
 
-def test_the_binary_is_named_and_hashed():
-    """Version line and sha256 are those of the program that is run."""
+def test_binary_has_path_version_hash_and_encoders():
     path = ffmpeg_executable()
     assert os.access(path, os.X_OK)
     assert ffmpeg_version().startswith("ffmpeg version ")
@@ -41,20 +40,15 @@ def test_the_binary_is_named_and_hashed():
 @pytest.mark.parametrize(
     ("libavutil", "option"), [("56. 70.100", "-vsync"), ("61.  1.102", "-fps_mode")]
 )
-def test_an_old_ffmpeg_is_asked_in_its_own_words(
-    libavutil, option, tmp_path, monkeypatch
-):
-    """5.1 renamed the option that lets each frame pass, and 9 took the old one away."""
+def test_frame_option_depends_on_the_version(libavutil, option, tmp_path, monkeypatch):
+    """5.1 renamed the option, and 9 removed the old name."""
     text = f"printf 'ffmpeg version x\\nlibavutil      {libavutil} / {libavutil}\\n'"
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script(tmp_path / "other", text)))
     assert every_frame_arguments() == (option, "passthrough")
 
 
 @pytest.mark.parametrize("is_named", [True, False])
-def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
-    tmp_path, monkeypatch, is_named
-):
-    """A file that is executable and no program: the reason, and how to get another."""
+def test_unstartable_program_is_an_error_with_the_fix(tmp_path, monkeypatch, is_named):
     broken = script(tmp_path / "broken", "")
     broken.write_bytes(b"\0\0\0\0")
     error = MissingDependency
@@ -72,11 +66,11 @@ def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
 
 @pytest.fixture
 def hang_at(tmp_path, monkeypatch):
-    """Run a shell script for ffmpeg, which hangs after a moment without progress."""
+    """Replace ffmpeg by a shell script, which hangs after 0.3 s without progress."""
     monkeypatch.setenv("MJREC_TIMEOUT", "0.3")
 
     def run(text):
-        # Not replaced by what it starts: a wrapper script, that has to go with it.
+        # The shell stays as the parent of its command, like a wrapper script.
         program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
 
@@ -88,8 +82,7 @@ def hang_at(tmp_path, monkeypatch):
     [lambda p: p.write(bytes(3 << 20)), lambda p: p.read(1), FfmpegProcess.wait],
     ids=["write", "read", "wait"],
 )
-def test_a_process_that_hangs_is_ended(wait, hang_at):
-    """With what it has started, whether it takes or gives nothing or does not end."""
+def test_hanging_process_is_killed_with_its_children(wait, hang_at):
     hang_at("sleep 33.75")
     process = FfmpegProcess(["-"], what="No.", reads=True, writes=True)
     try:
@@ -98,20 +91,18 @@ def test_a_process_that_hangs_is_ended(wait, hang_at):
     finally:
         process.kill()
         process.release()
-    wait_until(
-        lambda: b"sleep\00033.75\0" not in map(command_of, Path("/proc").iterdir())
-    )
+    wait_until(lambda: b"sleep\00033.75\0" not in map(cmdline, Path("/proc").iterdir()))
 
 
-def command_of(process):
+def cmdline(process):
     try:
         return (process / "cmdline").read_bytes()
     except OSError:
         return b""
 
 
-def test_a_slow_process_does_not_hang(tmp_path, hang_at):
-    """As long as something moves: what it takes, gives, or writes into its file."""
+def test_slow_process_is_not_killed(tmp_path, hang_at):
+    """Progress is what it reads, prints or writes into its file."""
     out = tmp_path / "out"
     hang_at(
         "for k in 1 2 3 4 5; do head -c 65536 >/dev/null; echo $k; sleep 0.1; done; "
@@ -124,23 +115,19 @@ def test_a_slow_process_does_not_hang(tmp_path, hang_at):
     process.release()
 
 
-# What is remembered of a program, and of which
-
-
-def test_a_program_is_asked_once(tmp_path, monkeypatch):
-    """Until its file is another one, or what was remembered cannot be read."""
+def test_answers_are_remembered_until_the_program_changes(tmp_path, monkeypatch):
     program, cache = tmp_path / "program", tmp_path / "cache"
     program.write_text("one")
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr(ffmpeg, "ffmpeg_executable", lambda: str(program))
 
     def ask(answer):
-        """Ask as a new process does."""
+        """Ask as a new process would."""
         ffmpeg._answers.clear()
         return remembered("does it work?", lambda: answer)
 
     assert [ask("yes"), ask("no")] == ["yes", "yes"]
-    # Of the same size and time of change.
+    # Its size and modification time stay.
     before = program.stat()
     program.write_text("two")
     os.utime(program, ns=(before.st_atime_ns, before.st_mtime_ns))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of a model and of a view, read and set by their names."""
+"""Fields of models and facts of views, as files name them."""
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ XML = """
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("site_colour", np.zeros(4), "has no model field 'site_colour'"),
+        ("site_color", np.zeros(4), "has no model field 'site_color'"),
         ("opt.__class__", np.zeros(1), "has no model field"),
         ("site_pos", np.zeros((2, 3)), r"shape \(1, 3\) here"),
         ("opt.timestep", np.zeros(2), r"shape \(\) here"),
@@ -38,8 +38,8 @@ XML = """
         ("option.label", np.array(1 << 30), "must be between 0 and"),
     ],
 )
-def test_what_cannot_be_set_is_refused(name, value, words):
-    """A file may name anything: MuJoCo would read foreign memory at a wrong index."""
+def test_invalid_fields_are_rejected(name, value, words):
+    """MuJoCo would read foreign memory at a wrong index."""
     model = mujoco.MjModel.from_xml_string(XML)
     with pytest.raises(InvalidArgument, match=words):
         apply_fields(model, {name: value}, option=mujoco.MjvOption())
@@ -48,24 +48,15 @@ def test_what_cannot_be_set_is_refused(name, value, words):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("camera", None),
-        ("camera", {"type": 0}),
-        ("max_geom", 0),
-        ("max_geom", 1 << 40),
-        ("height", "48"),
-        ("camera.lookat", [0, 1]),
-        ("camera.lookat", ["a", "b", "c"]),
-        ("camera.type", None),
-        ("option.flags", [True]),
-        ("option.label", -1),
-        ("option.frame", 0.5),
-        ("option.frame", 1 << 30),
-        ("label", ["side"]),
-        ("label", "x" * 10_000),
+        *(("camera", None), ("camera", {"type": 0}), ("camera.type", None)),
+        *(("camera.lookat", [0, 1]), ("camera.lookat", ["a", "b", "c"])),
+        *(("max_geom", 0), ("max_geom", 1 << 40), ("height", "48")),
+        *(("option.flags", [True]), ("option.label", -1)),
+        *(("option.frame", 0.5), ("option.frame", 1 << 30)),
+        *(("label", ["side"]), ("label", "x" * 10_000)),
     ],
 )
-def test_facts_that_cannot_be_are_refused_by_name(name, value):
-    """They may come from a file."""
+def test_invalid_facts_of_a_view_are_rejected_by_name(name, value):
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     more = {"max_geom": 1000, "fresh": True, "height": 48, "width": 64}
     facts = SceneView(camera=camera, option=option, label="side", **more).facts()

@@ -24,12 +24,11 @@ HEIGHT, WIDTH = 47, 64
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """An episode of ten steps of 0.05 s, of an odd height."""
+    """Record an episode of ten steps of 0.05 s, with an odd height."""
     directory = tmp_path_factory.mktemp("strip")
     size = {"width": WIDTH, "height": HEIGHT, "max_episode_steps": 10}
-    record(
-        gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size), directory, 1
-    )
+    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
+    record(env, directory, 1)
     return directory
 
 
@@ -40,7 +39,7 @@ def video(recorded):
 
 
 def cells(strip, rows, columns, height=HEIGHT, width=WIDTH):
-    """Cut a strip's frames out, by its margins of white."""
+    """Cut the frames out of a strip."""
     gap = max(2, round(0.03 * min(height, width)))
     row_height = (strip.shape[0] - gap) // rows
     return [
@@ -52,21 +51,19 @@ def cells(strip, rows, columns, height=HEIGHT, width=WIDTH):
 
 @pytest.fixture
 def labels(monkeypatch):
-    """What is written under the frames."""
-    written = []
-    labels_of = module._labels
+    """Return the list of labels under the frames."""
+    written, labels_of = [], module._labels
 
-    def noting(seconds):
+    def write(seconds):
         written[:] = labels_of(seconds)
-        return list(written)
+        return written
 
-    monkeypatch.setattr(module, "_labels", noting)
+    monkeypatch.setattr(module, "_labels", write)
     return written
 
 
 @pytest.mark.thorough
-def test_frames_of_a_trajectory_are_those_rendered(recorded, labels):
-    """Evenly spread, byte for byte, from any camera and of any size."""
+def test_frames_of_a_trajectory_are_rendered_from_any_camera(recorded, labels):
     [trajectory] = recorded.glob("*.h5")
     rendered = list(mjrec.render(trajectory))
     shown = cells(film_strip(trajectory, frames=3), 1, 3)
@@ -77,12 +74,12 @@ def test_frames_of_a_trajectory_are_those_rendered(recorded, labels):
     np.testing.assert_array_equal(first, next(mjrec.render(trajectory, **other)))
 
 
-def test_frames_of_a_video_are_those_decoded(video, labels):
-    """Without the row that made its height even, and with simulated times."""
+def test_frames_of_a_video_are_decoded_with_simulated_times(video, labels):
+    """Without the row that made its height even."""
     strip = film_strip(video, frames=6, columns=3)
     decoded = np.array(frames_of(video)[::2])[:, :HEIGHT].astype(int)
     assert np.abs(cells(strip, 2, 3) - decoded).max() <= 2
-    # What is no frame is white paper; letters stand in between.
+    # Margins are white, with labels below the frames.
     assert (strip[:2] == 255).all()
     assert (strip[:, :2] == 255).all()
     assert strip[2 + HEIGHT : strip.shape[0] // 2, :, 0].min() < 64
@@ -100,10 +97,8 @@ def test_frames_of_a_video_are_those_decoded(video, labels):
         '{"height": 3, "width": 3, "timestep": "1/20"}',
     ],
 )
-def test_without_metadata_that_fit_a_video_has_its_own_times(
-    video, tmp_path, text, labels
-):
-    """They may be anybody's, and claim any number of frames."""
+def test_invalid_metadata_leave_the_times_of_the_video(video, tmp_path, text, labels):
+    """Metadata may claim any number of frames."""
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(video.read_bytes())
     if text is not None:
@@ -114,14 +109,13 @@ def test_without_metadata_that_fit_a_video_has_its_own_times(
 
 
 @pytest.mark.parametrize(("frames", "columns"), [(8, 8), (9, 5)])
-def test_usual_columns(video, frames, columns):
-    """Up to eight stand in one row, more in rows of equal length."""
+def test_rows_have_equal_lengths_of_at_most_eight_frames(video, frames, columns):
     strip = film_strip(video, frames=frames)
     assert strip.shape[1] == 2 + columns * (WIDTH + 2)
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "said"),
+    ("kind", "options", "message"),
     [
         ("mp4", {"frames": 12}, "has only 11 frames, not 12"),
         ("h5", {"frames": 12}, "has only 11 frames, not 12"),
@@ -131,17 +125,15 @@ def test_usual_columns(video, frames, columns):
         ("mp4", {"frames": 4}, "Request fewer or smaller"),
     ],
 )
-def test_what_cannot_be_shown(recorded, monkeypatch, kind, options, said):
-    """Is an error that says what can."""
+def test_impossible_strips_are_errors(recorded, monkeypatch, kind, options, message):
     [file] = recorded.glob(f"*.{kind}")
     monkeypatch.setattr(module, "_MOST_PIXELS", 3 * HEIGHT * WIDTH)
     assert film_strip(file, frames=2).size
-    with pytest.raises(InvalidArgument, match=said):
+    with pytest.raises(InvalidArgument, match=message):
         film_strip(file, **options)
 
 
-def test_other_files(video, tmp_path):
-    """Neither a video nor a trajectory, or damaged, or not there: it is named."""
+def test_unreadable_files_are_errors_with_the_name(video, tmp_path):
     text, cut = tmp_path / "notes.txt", tmp_path / "cut.mp4"
     text.write_text("no video")
     cut.write_bytes(video.read_bytes()[:600])
@@ -153,22 +145,22 @@ def test_other_files(video, tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".mp4", ".avi", ".mkv"])
-def test_each_frame_is_the_right_one(tmp_path, ending):
-    """Of each kind of video, at a rate whose times are no round numbers."""
-    path = tmp_path / f"grey{ending}"
+def test_exact_frames_of_each_kind_of_video_are_read(tmp_path, ending):
+    """Times of this rate are no round numbers."""
+    path = tmp_path / f"gray{ending}"
     with mjrec.VideoWriter(path, fps=30) as writer:
         for i in range(40):
             writer.write(np.full((16, 16, 3), 6 * i, np.uint8))
     stream = read_stream(path)
     assert (len(stream), stream.seconds) == (40, pytest.approx(4 / 3, abs=0.01))
-    # More than are decoded at once.
+    # More frames than one decoding.
     indices = [i for i in range(40) if i % 5]
     means = [frame.mean() for frame in frames_at(stream, indices)]
     np.testing.assert_allclose(means, [6 * i for i in indices], atol=2)
 
 
-def test_a_strip_is_a_whole_png_for_print(video, tmp_path):
-    """Of 300 dots per inch, with the very pixels; else nothing is written."""
+def test_strip_is_a_png_with_300_dots_per_inch(video, tmp_path):
+    """A failure leaves no file."""
     strip = film_strip(video, frames=2)
     with pytest.raises(InvalidArgument, match=r"strip\.png"):
         write_film_strip(tmp_path / "strip.jpg", strip)
@@ -181,8 +173,8 @@ def test_a_strip_is_a_whole_png_for_print(video, tmp_path):
         np.testing.assert_array_equal(np.asarray(image), strip)
 
 
-def test_the_command_writes_a_frame_and_says_its_size(video, tmp_path, capsys):
-    """In as many columns as asked for; nothing where a video cannot show it."""
+def test_command_writes_a_strip_and_prints_its_size(video, tmp_path, capsys):
+    """Impossible requests write nothing."""
     out = tmp_path / "strip.png"
     with pytest.raises(InvalidArgument, match="trajectory"):
         strip(video, size="640x480", out=out)
@@ -192,12 +184,12 @@ def test_the_command_writes_a_frame_and_says_its_size(video, tmp_path, capsys):
         assert image.width == 2 + 2 * (WIDTH + 2)
         assert f"{image.width}x{image.height} pixels" in capsys.readouterr().out
     assert strip(video, frames=1, out=out, as_json=True) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == {"strip": str(out), "width": 4 + WIDTH, "height": said["height"]}
+    printed = json.loads(capsys.readouterr().out)
+    height = printed["height"]
+    assert printed == {"strip": str(out), "width": 4 + WIDTH, "height": height}
 
 
-def test_without_pillow(video, monkeypatch):
-    """An error names the extra."""
+def test_missing_pillow_is_an_error(video, monkeypatch):
     check_annotation.cache_clear()
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(mjrec.MissingDependency, match="Pillow"):

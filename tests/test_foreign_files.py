@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What strangers have recorded is read in a sandbox first, and once."""
+"""Recordings of others are checked in a sandbox, once per version of a file."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ from mjrec.simulation.model_trust import directory_digest, note_models
 
 @pytest.fixture
 def started(monkeypatch):
-    """The modules that were started in a sandbox."""
+    """Return the list of modules started in a sandbox."""
     modules, real = [], foreign_files.Sandbox
 
     def counted(module, *arguments, **options):
@@ -28,8 +28,8 @@ def started(monkeypatch):
     return modules
 
 
-def test_a_strangers_file_is_vetted_once(tmp_path, started):
-    """Until it is another one; a log, in which nothing is packed, is not."""
+def test_foreign_file_is_checked_once_until_it_changes(tmp_path, started):
+    """A log is not checked, because nothing in it is compressed."""
     mjrec.load_trajectory(write_log(tmp_path, 1))
     assert started == []
     path = finished(tmp_path)
@@ -41,8 +41,8 @@ def test_a_strangers_file_is_vetted_once(tmp_path, started):
     assert len(started) == 2
 
 
-def test_ones_own_files_cost_no_process(tmp_path, started, monkeypatch):
-    """Those of a directory that this user has recorded into, wherever they moved."""
+def test_own_files_start_no_sandbox(tmp_path, started, monkeypatch):
+    """They contain models of this user's list, wherever they moved."""
     own = tmp_path / "own"
     with mjrec.Monitor(gymnasium.make("InvertedPendulum-v5"), own, workers=0) as env:
         env.reset(seed=1)
@@ -56,7 +56,7 @@ def test_ones_own_files_cost_no_process(tmp_path, started, monkeypatch):
     note_models([directory_digest(copy.parent)])
     os.utime(copy, (0, 0))
     mjrec.load_trajectory(copy)
-    # Somebody else, who has the same list of models.
+    # Another user has another list of models.
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
     mjrec.load_trajectory(path)
     assert len(started) == 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike frames are, as an encoder sees them."""
+"""Similarity of frames in the encoder's color planes."""
 
 import numpy as np
 import pytest
@@ -17,15 +17,14 @@ from mjrec.formats.video_writer import VideoWriter
 
 
 def noise(height=48, width=64):
-    """Return a frame with everything in it, softened as frames are."""
     random = np.random.default_rng(0)
     small = random.integers(0, 256, (height // 4 + 1, width // 4 + 1, 3), np.uint8)
     return np.repeat(np.repeat(small, 4, 0), 4, 1)[:height, :width].copy()
 
 
 @pytest.mark.parametrize("size", [(48, 64), (33, 47), (1, 1)])
-def test_planes_are_those_that_the_encoder_is_given(tmp_path, size):
-    """To within a level, against ffmpeg's own conversion without any loss."""
+def test_planes_equal_ffmpegs_own_conversion(tmp_path, size):
+    """Within one level, compared with lossless video."""
     frame, path = noise(*size), tmp_path / "lossless.mp4"
     with VideoWriter(path, fps=10, crf=0) as video:
         video.write(frame)
@@ -36,23 +35,22 @@ def test_planes_are_those_that_the_encoder_is_given(tmp_path, size):
         assert np.abs(ours.astype(int) - theirs).max() <= 1
 
 
-def test_measures_are_what_their_names_say():
-    """Finite for equal frames; PSNR of all planes; structure, not a histogram."""
+def test_psnr_and_ssim_have_known_values():
     planes = planes_of(noise())
     assert similarity(planes, planes) == (100.0, pytest.approx(1.0), 0.0)
-    # The mirror image has the same pixels.
+    # The mirror image has the same histogram.
     assert similarity(planes, planes_of(noise()[:, ::-1])).ssim < 0.5
-    # A level more everywhere is a mean square of one.
+    # One level more everywhere is a mean square error of one.
     planes = planes_of(np.full((16, 16, 3), 100, np.uint8))
     more = type(planes)(*(plane + 1 for plane in planes))
     assert similarity(planes, more).psnr == pytest.approx(48.13, abs=0.01)
-    colour_only = planes._replace(red=planes.red + 1)
-    assert similarity(planes, colour_only).psnr == pytest.approx(55.91, abs=0.01)
+    color_only = planes._replace(red=planes.red + 1)
+    assert similarity(planes, color_only).psnr == pytest.approx(55.91, abs=0.01)
 
 
 @pytest.mark.parametrize(("y", "x"), [(0, 0), (20, 20), (22, 30), (47, 63)])
-def test_the_worst_block_sees_a_few_pixels_wherever_they_are(y, x):
-    """Also where they lie across the blocks' corners or at the frame's edge."""
+def test_worst_block_notices_few_pixels_anywhere(y, x):
+    """Also across corners of blocks and at the frame's edge."""
     frame = np.full((48, 64, 3), 40, np.uint8)
     changed = frame.copy()
     changed[y : y + 4, x : x + 4] = 255
@@ -65,8 +63,8 @@ def test_the_worst_block_sees_a_few_pixels_wherever_they_are(y, x):
     ("limits", "side", "levels"),
     [(OTHER_CPU, 2, 20), (OTHER_ENCODER, 2, 40), (OTHER_RENDERER, 4, 70)],
 )
-def test_a_change_beyond_the_limits_is_noticed(limits, side, levels):
-    """A square of half the contrast, and a patch of so many levels."""
+def test_limits_notice_small_squares_and_patches(limits, side, levels):
+    """A square of half the contrast, or a patch with more levels."""
     exact = planes_of(np.full((64, 64, 3), 60, np.uint8))
 
     def strain(rows, more):
@@ -80,8 +78,7 @@ def test_a_change_beyond_the_limits_is_noticed(limits, side, levels):
     assert strain(slice(11, 12), 40) < 1
 
 
-def test_a_shadow_is_taken_away_whichever_frame_it_is_in():
-    """A patch of any colours that is darker in one frame counts as equal."""
+def test_shadow_in_either_frame_is_removed():
     shaded = noise()
     shaded[8:16, 8:24] //= 4
     lit, shaded = planes_of(noise()), planes_of(shaded)
@@ -89,12 +86,11 @@ def test_a_shadow_is_taken_away_whichever_frame_it_is_in():
         unshadowed, share = but_for_shadows(one, other)
         assert similarity(one, other).block > 50
         assert similarity(one, unshadowed).block < 20
-        # A part of it is too dark already to get much darker.
+        # Dark parts cannot get much darker.
         assert 0.02 < share <= 8 * 16 / (48 * 64)
 
 
-def test_another_colour_is_no_shadow():
-    """Red instead of green stays, however dark."""
+def test_other_colors_are_no_shadows():
     green = np.full((48, 64, 3), (20, 200, 20), np.uint8)
     red = green.copy()
     red[8:16, 8:24] = (90, 10, 10)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report shows is gathered from directories of every kind."""
+"""Reports gather their contents from recordings and evaluations."""
 
 import json
 import os
 import re
 import shlex
-import shutil
 from pathlib import Path
 
 import gymnasium
@@ -15,7 +14,6 @@ from parts import parametrize
 
 import mjrec
 from evaluations import write_evaluation, write_recorded
-from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
 from mjrec.evaluation.summaries import AcrossTasks
@@ -28,7 +26,7 @@ from report_recordings import GYM, entry, record, write_journal
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Two recorded episodes of six steps, with two cameras, whose states are there."""
+    """Return recordings of two episodes of six steps, with two cameras."""
     directory = tmp_path_factory.mktemp("my recordings")
     size = {"width": 64, "height": 48, "max_episode_steps": 6}
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
@@ -36,12 +34,8 @@ def recorded(tmp_path_factory):
     return directory
 
 
-# --- Monitor directories ----------------------------------------------------------
-
-
-# Takes more than five seconds: its fixture records what all tests of the file read.
-def test_a_monitor_directory_is_one_task(recorded):
-    """Episodes in the order of time, and videos with what their metadata say."""
+# Takes more than five seconds: its fixture records for all tests of this file.
+def test_monitor_directory_is_one_task_with_its_videos(recorded):
     contents = gather(recorded)
     [task] = contents.tasks
     assert (task.name, task.source) == ("HalfCheetah-v5", str(recorded))
@@ -60,21 +54,20 @@ def test_a_monitor_directory_is_one_task(recorded):
 
 
 @parametrize("number", [0, 1])
-def test_the_command_renders_a_video_again(recorded, number, tmp_path, monkeypatch):
-    """As it stands there, for the first camera and a further one; the same pixels."""
+def test_video_command_renders_again(recorded, number, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     video = gather(recorded).videos[number]
-    words = shlex.split(video.command)
-    assert words[0] == "mjrec"
-    assert main(words[1:]) == 0
-    decoded = json.loads(Path("again.meta.json").read_text())["decoded_sha256"]
-    metadata = video.path.with_suffix(".meta.json")
-    assert decoded == json.loads(metadata.read_text())["decoded_sha256"]
+    program, *arguments = shlex.split(video.command)
+    assert program == "mjrec"
+    command(*arguments)
+    paths = (Path("again.meta.json"), video.path.with_suffix(".meta.json"))
+    again, first = (json.loads(path.read_text())["decoded_sha256"] for path in paths)
+    assert again == first
 
 
 @pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir() if p.is_dir()))
-def test_recordings_of_every_gym_are_gathered(version):
-    """Each directory is found one level below, with all episodes and text videos."""
+def test_gathers_recordings_of_every_gym_version(version):
+    """It finds directories one level below, and text videos."""
     tasks = {Path(task.source).name: task for task in gather(GYM / version).tasks}
     assert tasks.keys() == {p.name for p in (GYM / version).iterdir()}
     assert tasks["two_monitors"].summary.runs == 2
@@ -85,8 +78,8 @@ def test_recordings_of_every_gym_are_gathered(version):
             assert [video.path.suffix for video in task.videos] == [".json"] * 2
 
 
-def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
-    """What has no time comes last; what is not known of success stays unknown."""
+def test_episodes_of_several_monitors_are_sorted_by_time(tmp_path):
+    """An unknown time comes last, and unknown success stays unknown."""
     early = [entry(0, end_time=3.0e9, success=True), entry(1)]
     late = [entry(0, end_time=2.0e9, success=False), entry(1, end_time=np.nan)]
     write_journal(tmp_path, "0.a", "X-v0", early)
@@ -99,13 +92,13 @@ def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
     assert (summary.runs, summary.success_known, summary.success_rate) == (2, 2, 0.5)
 
 
-def test_several_environments_are_tasks_of_their_own(tmp_path):
-    """In one directory, which is told, and in several, by the directory's name."""
+def test_each_environment_of_each_directory_is_a_task(tmp_path):
+    """It reports a directory with several environments."""
     a, b = tmp_path / "a", tmp_path / "b"
     write_journal(a, "0.a", "X-v0", [entry(0)])
     write_journal(a, "1.a", "Y-v0", [entry(0), entry(1)])
     write_journal(b, "0.x", "X-v0", [entry(0)])
-    # One that is given twice counts once.
+    # A directory given twice counts once.
     contents = gather([a, b, b / "."])
     tasks = [(task.name, task.summary.episodes) for task in contents.tasks]
     assert tasks == [(f"X-v0 ({a})", 1), ("Y-v0", 2), (f"X-v0 ({b})", 1)]
@@ -114,11 +107,9 @@ def test_several_environments_are_tasks_of_their_own(tmp_path):
     assert contents.title == "Recordings: 3 tasks"
 
 
-def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path):
-    """A whole file, and a line of a journal, which is otherwise only in the log."""
+def test_damaged_files_are_problems_and_the_rest_is_shown(tmp_path):
     path = write_journal(tmp_path, "0.a", "X-v0", [entry(0), entry(1)])
-    with path.open("a") as file:
-        file.write('{"episode_id": 2, "len\n')
+    path.write_text(path.read_text() + '{"episode_id": 2, "len\n')
     (tmp_path / "openaigym.manifest.1.b.manifest.json").write_text("{")
     contents = gather(tmp_path)
     assert [(task.name, len(task.episodes)) for task in contents.tasks] == [("X-v0", 2)]
@@ -128,18 +119,18 @@ def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path):
 
 
 @pytest.mark.parametrize("there", ["link", "pipe"])
-def test_what_stands_in_the_place_of_a_video_is_left_out(corridor, tmp_path, there):
-    """A link could put any file of the reader into a report; a pipe never ends."""
+def test_links_and_pipes_in_place_of_videos_are_omitted(corridor, tmp_path, there):
+    """A link could put any file of the reader into a report."""
     directory = tmp_path / "run"
     record(corridor, directory, 1)
-    # What was drawn live cannot be rendered again, and that is said.
+    # A live video has no command that renders it.
     [shown] = gather(directory).videos
     assert shown.command is None
     assert any("live" in note for note in shown.notes)
     [video] = directory.glob("*.mp4")
-    shutil.move(video, tmp_path / "secret.mp4")
+    secret = video.rename(tmp_path / "secret.mp4")
     if there == "link":
-        video.symlink_to(tmp_path / "secret.mp4")
+        video.symlink_to(secret)
     else:
         os.mkfifo(video)
     contents = gather(directory)
@@ -158,8 +149,7 @@ def test_what_stands_in_the_place_of_a_video_is_left_out(corridor, tmp_path, the
         {"selection": {"rule": "best:1", "decided": True, "finished": "many"}},
     ],
 )
-def test_metadata_may_say_anything(corridor, tmp_path, metadata):
-    """What is nonsense is not known; the video is shown."""
+def test_invalid_metadata_does_not_hide_the_video(corridor, tmp_path, metadata):
     record(corridor, tmp_path, 1)
     [path] = tmp_path.glob("*.meta.json")
     path.write_text(json.dumps(metadata))
@@ -167,11 +157,8 @@ def test_metadata_may_say_anything(corridor, tmp_path, metadata):
     assert (video.seconds, video.height) == (None, None)
 
 
-# --- Evaluations ------------------------------------------------------------------
-
-
-def test_an_evaluation_has_its_results(tmp_path):
-    """Its summaries are those of its file, its episodes in the plan's order."""
+def test_evaluation_has_the_results_of_its_files(tmp_path):
+    """Its summaries come from its file, its episodes in the plan's order."""
     write_recorded(tmp_path / "e", ["a/x", "b/y"])
     write_journal(tmp_path / "m", "0.a", "X-v0", [entry(i) for i in range(20)])
     contents = gather([tmp_path / "e", tmp_path / "m"])
@@ -186,14 +173,13 @@ def test_an_evaluation_has_its_results(tmp_path):
     assert (task.summary.episodes, task.summary.failed) == (3, 1)
     assert ("Seeds", "0, 7") in task.provenance
     assert ("Versions", "mjrec 9.9, MuJoCo 8.8") in task.provenance
-    # One sentence about intervals is true of the whole page.
+    # All intervals of a page use one bootstrap.
     assert (contents.bootstrap.seed, contents.bootstrap.resamples) == (3, 100)
     [alone] = gather(tmp_path / "m").tasks
     assert contents.tasks[-1].summary.mean_interval != alone.summary.mean_interval
 
 
-def test_what_was_evaluated_is_told(tmp_path):
-    """The policy with its arguments; scores only where a task has a scale."""
+def test_policies_with_arguments_and_scores_are_shown(tmp_path):
     write_evaluation(
         *(tmp_path / "a", {"a/x": [[1.0]]}),
         policy="mine:Policy",
@@ -208,8 +194,7 @@ def test_what_was_evaluated_is_told(tmp_path):
     assert contents.across == {str(tmp_path / "b"): scores}
 
 
-def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
-    """By monitor and number; the best of the task is called so."""
+def test_videos_of_an_evaluation_belong_to_episodes_and_roles(corridor, tmp_path):
     record(corridor, tmp_path / "a-x", 1, uid="batch")
     [journal] = (tmp_path / "a-x").glob("*.jsonl")
     journal.unlink()
@@ -222,8 +207,7 @@ def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
     assert contents.problems == []
 
 
-def test_problems_of_evaluations_are_told(tmp_path):
-    """Pending videos with the command for them, and intervals made in another way."""
+def test_pending_videos_and_differing_intervals_are_problems(tmp_path):
     name = "openaigym.video.0.batch.video000000.mp4"
     write_recorded(tmp_path / "a", ["a/x"], videos={"a/x": name})
     write_evaluation(tmp_path / "b", {"b/y": [[1.0, 2.0]]}, monitor="0.batch")
@@ -234,17 +218,14 @@ def test_problems_of_evaluations_are_told(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("broken", "content", "told"),
+    ("broken", "content", "reason"),
     [
         (None, None, "not finished"),
         ("results.json", '{"format_version": 1', "results.json"),
         ("results.csv", "no table", "results.csv"),
     ],
 )
-def test_an_evaluation_without_results_is_shown_by_its_monitors(
-    tmp_path, broken, content, told
-):
-    """Whether it is not finished or a file is damaged, which is said."""
+def test_evaluation_without_results_shows_monitors(tmp_path, broken, content, reason):
     write_recorded(tmp_path, ["a/x", "b/y"], finished=broken is not None)
     if broken:
         (tmp_path / broken).write_text(content)
@@ -253,22 +234,15 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
     assert tasks == [("a/x", False), ("b/y", False)]
     assert contents.tasks[0].episodes["total_reward"].tolist() == [3.0, 1.0, 2.0]
     [problem] = contents.problems
-    assert told in problem
+    assert reason in problem
     assert "The recordings of its monitors are shown instead." in problem
-
-
-# --- Roles and verdicts -----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "rewards",
-    [
-        (2.0, 5.0, 5.0, 1.0, 1.0, 2.0),
-        *((5.0, 5.0), (9.0, None, 1.0, 2.0), (np.nan, -np.inf, 0.0, 1.0)),
-    ],
+    [(2, 5, 5, 1, 1, 2), (5.0, 5.0), (9, None, 1, 2), (np.nan, -np.inf, 0.0, 1.0)],
 )
-def test_roles_are_those_of_an_evaluation(tmp_path, rewards):
-    """The rule that chose the videos and the page call the same episodes the best."""
+def test_roles_are_those_of_the_selection_rule(tmp_path, rewards):
     write_recorded(tmp_path, ["a/x"], rewards=rewards)
     results = list(read_results(tmp_path))
     expected = {}
@@ -279,14 +253,14 @@ def test_roles_are_those_of_an_evaluation(tmp_path, rewards):
     assert episodes_with_roles(gather(tmp_path).tasks[0]) == expected
 
 
-def verdict(outcome, **said):
+def verdict(outcome, **fields):
     """Return the text of a verification with one finding."""
     known = {"path": "run", "level": "physics", "findings": [{"outcome": outcome}]}
-    return json.dumps({**known, **said})
+    return json.dumps({**known, **fields})
 
 
-def test_verdicts_are_found_and_given(tmp_path):
-    """In the directory, and as a file; what is only noted does not count."""
+def test_verdicts_come_from_the_directory_and_from_given_files(tmp_path):
+    """Noted findings do not count."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
     found, given = tmp_path / "run" / "verification.json", tmp_path / "other.json"
     outcomes = [{"outcome": each} for each in ("recreated", "believed", "noted")]
@@ -306,8 +280,8 @@ def test_verdicts_are_found_and_given(tmp_path):
         verdict("recreated", verdict="PASS", level="all"),
     ],
 )
-def test_a_verdict_that_is_none_is_not_shown(tmp_path, text):
-    """One that contradicts itself neither; a file that was given is an error."""
+def test_invalid_verdicts_are_problems(tmp_path, text):
+    """A verdict may contradict itself; a given file is an error."""
     write_journal(tmp_path, "0.a", "X-v0", [entry(0)])
     path = tmp_path / "verification.json"
     path.write_text(text)
@@ -318,8 +292,7 @@ def test_a_verdict_that_is_none_is_not_shown(tmp_path, text):
         gather(tmp_path, verifications=[path])
 
 
-def test_a_directory_without_recordings_is_an_error(tmp_path):
-    """It is named, with what to do; so is one that is not there, or a file."""
+def test_directories_without_recordings_are_errors(tmp_path):
     (tmp_path / "deep" / "deeper").mkdir(parents=True)
     write_journal(tmp_path / "deep" / "deeper", "0.a", "X-v0", [entry(0)])
     named = tmp_path / "my runs; $(x)"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`use_gl`, in processes of their own: it is about what a process has done so far."""
+"""`use_gl`, in new processes, because it depends on their imports."""
 
 import pytest
 from other_python import run_python, without_gl
@@ -12,12 +12,12 @@ _HEAD = "import logging, os, sys; import mjrec; logging.basicConfig(level='INFO'
 
 
 def run(code, **variables):
-    """Run `code` in a Python whose environment chooses no OpenGL but these."""
+    """Run `code` in a Python with only these variables for OpenGL."""
     return run_python(_HEAD + code, env=without_gl(**variables))
 
 
 def error_of(code, **variables):
-    """Return how `code` failed, and that no variable has changed."""
+    """Return the error of `code`, which must change no variable."""
     body = "\n  ".join(code.splitlines())
     wrapped = (
         f"before = dict(os.environ)\ntry:\n  {body}\n"
@@ -34,22 +34,22 @@ def error_of(code, **variables):
     [
         ("answer = mjrec.use_gl()", {}),
         ("answer = mjrec.use_gl(' EGL ')", {}),
-        # What is set is the spelling that every program understands.
+        # It sets the spelling that every program understands.
         ("answer = mjrec.use_gl()", {"MUJOCO_GL": "EGL"}),
         ("answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "nonsense"}),
-        # Rendering is on, by which backend is left open.
+        # "on" leaves the backend open.
         ("answer = mjrec.use_gl()", {"MUJOCO_GL": "on"}),
         ("answer = mjrec.use_gl()", {"PYOPENGL_PLATFORM": "osmesa"}),
         ("import mujoco; answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "egl"}),
     ],
 )
-def test_a_backend_is_taken(code, variables):
-    """The argument, else the variable, else the first that renders; both variables."""
+def test_backend_comes_from_argument_variable_or_first_that_renders(code, variables):
+    """It sets both variables."""
     assert run(code + _SHOW, **variables).stdout == "egl egl egl\n"
 
 
-def test_mujoco_then_takes_the_choice():
-    """What is imported afterwards draws by it; importing mjrec.gl imports none."""
+def test_mujoco_imported_later_uses_the_backend():
+    """Importing mjrec.gl imports neither mujoco nor OpenGL."""
     code = (
         "import mjrec.gl\n"
         "assert not {'mujoco', 'OpenGL', 'glfw', 'dm_control'} & set(sys.modules)\n"
@@ -59,63 +59,21 @@ def test_mujoco_then_takes_the_choice():
 
 
 @pytest.mark.parametrize(
-    ("code", "variables", "said"),
+    ("code", "variables", "words"),
     [
         ("mjrec.use_gl('cuda')", {}, ["UnknownName There is no OpenGL backend 'cuda'"]),
         (
-            "mjrec.use_gl()",
-            {"MUJOCO_GL": "nonsense"},
+            *("mjrec.use_gl()", {"MUJOCO_GL": "nonsense"}),
             ["UnknownName", "comes from the environment variable MUJOCO_GL"],
         ),
         ("mjrec.use_gl()", {"MUJOCO_GL": "Off"}, ["GLError", "turns rendering off"]),
         (
-            "mjrec.use_gl('glfw')",
-            {},
+            *("mjrec.use_gl('glfw')", {}),
             ["backend glfw (requested) cannot", "DISPLAY is not set", "xvfb-run"],
         ),
-    ],
-)
-def test_what_cannot_be_taken(code, variables, said):
-    """The error has the cause and what to do, and no variable changes."""
-    error = error_of(code, **variables)
-    assert all(each in error for each in said), error
-
-
-def test_the_next_one_where_the_first_crashes(tmp_path):
-    """A crash of EGL's driver leads to OSMesa, and the reason is logged."""
-    osmesa = probe("osmesa")
-    if not osmesa.renders:
-        pytest.skip(f"{osmesa.cause} {osmesa.fix}")
-    (tmp_path / "sitecustomize.py").write_text(
-        "import ctypes, os\n"
-        "if os.environ.get('MUJOCO_GL') == 'egl':\n  ctypes.string_at(0)\n"
-    )
-    code = "answer = mjrec.use_gl()" + _SHOW
-    done = run(code, PYTHONPATH=str(tmp_path))
-    assert done.stdout.strip() == "osmesa osmesa osmesa"
-    assert "egl cannot be used: The driver crashed (SIGSEGV)" in done.stderr
-
-
-def test_nothing_renders(tmp_path):
-    """Every backend is listed with its own cause and fix."""
-    for name in ("libEGL.so", "libOSMesa.so"):
-        for number in ["", *(f".{n}" for n in range(10))]:
-            (tmp_path / f"{name}{number}").touch()
-    said = error_of("mjrec.use_gl()", LD_LIBRARY_PATH=str(tmp_path))
-    assert said.startswith("GLError No OpenGL backend can be used here.\n")
-    assert "egl: EGL's library is installed but cannot be loaded" in said
-    assert "osmesa: OSMesa's library is installed but cannot be loaded" in said
-    assert "glfw: GLFW needs a display" in said
-    assert "apt-get install -y libegl1 " in said
-    assert "apt-get install -y libosmesa6 " in said
-
-
-@pytest.mark.parametrize(
-    ("code", "variables", "said"),
-    [
+        # An earlier import has chosen another backend.
         (
-            "import mujoco\nmjrec.use_gl('egl')",
-            {},
+            *("import mujoco\nmjrec.use_gl('egl')", {}),
             ["mujoco was imported with glfw", "switch to egl", "before anything"],
         ),
         (
@@ -123,18 +81,44 @@ def test_nothing_renders(tmp_path):
             {"PYOPENGL_PLATFORM": "glx"},
             ["PyOpenGL was imported with glx in this process"],
         ),
-        # Stands for dm_control with OSMesa, which not every machine has.
+        # A stand-in for dm_control with OSMesa, which not every machine has.
         (
             "import types\nmodule = types.ModuleType('dm_control._render')\n"
             "module.BACKEND = 'osmesa'\nsys.modules['dm_control._render'] = module\n"
             "mjrec.use_gl('egl')",
-            {},
-            ["dm_control was imported with osmesa"],
+            *({}, ["dm_control was imported with osmesa"]),
         ),
     ],
-    ids=["mujoco", "PyOpenGL", "dm_control"],
 )
-def test_what_was_imported_before(code, variables, said):
-    """A backend is taken once; the one that was is named, and the way out."""
+def test_unusable_backends_are_errors_with_cause_and_fix(code, variables, words):
     error = error_of(code, **variables)
-    assert all(each in error for each in said), error
+    assert all(each in error for each in words), error
+
+
+def test_crash_of_egl_leads_to_osmesa(tmp_path):
+    osmesa = probe("osmesa")
+    if not osmesa.renders:
+        pytest.skip(f"{osmesa.cause} {osmesa.fix}")
+    (tmp_path / "sitecustomize.py").write_text(
+        "import ctypes, os\n"
+        "if os.environ.get('MUJOCO_GL') == 'egl':\n  ctypes.string_at(0)\n"
+    )
+    done = run("answer = mjrec.use_gl()" + _SHOW, PYTHONPATH=str(tmp_path))
+    assert done.stdout.strip() == "osmesa osmesa osmesa"
+    assert "egl cannot be used: The driver crashed (SIGSEGV)" in done.stderr
+
+
+def test_error_lists_cause_and_fix_of_every_backend(tmp_path):
+    for name in ("libEGL.so", "libOSMesa.so"):
+        for number in ["", *(f".{n}" for n in range(10))]:
+            (tmp_path / f"{name}{number}").touch()
+    error = error_of("mjrec.use_gl()", LD_LIBRARY_PATH=str(tmp_path))
+    assert error.startswith("GLError No OpenGL backend can be used here.\n")
+    for words in (
+        "egl: EGL's library is installed but cannot be loaded",
+        "osmesa: OSMesa's library is installed but cannot be loaded",
+        "glfw: GLFW needs a display",
+        "apt-get install -y libegl1 ",
+        "apt-get install -y libosmesa6 ",
+    ):
+        assert words in error

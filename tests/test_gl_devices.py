@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering on a given GPU: found among EGL's devices, and said where there is none."""
+"""Rendering on a given GPU, found among EGL's devices."""
 
 import re
 from dataclasses import replace
@@ -13,19 +13,19 @@ from mjrec.gl.choice import probe
 from mjrec.gl.devices import device_of_gpu, visible_gpus
 from mjrec.gl.egl import EglDevice
 
-# As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
+# EGL's answers on a machine with one NVIDIA H100 (driver 580.159.04) while
 # CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
 H100 = EglDevice(index=0, device_file="", cuda_id=0, software=False, in_use=True)
 H100 = replace(H100, uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b")
-# There, while it was empty, "1", "-1" or another UUID.
+# The same, while it was empty, "1", "-1" or another UUID.
 HIDDEN = replace(H100, cuda_id=None)
-# There, in front of the GPU or behind it as the vendor files were ordered.
+# The order of the vendor files puts it before or after the GPU.
 LLVMPIPE = replace(HIDDEN, software=True, in_use=False, uuid="")
 OTHER = replace(HIDDEN, index=1, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211")
 
 
 def run(code, **variables):
-    """Run `code` in a Python whose environment chooses no OpenGL but these."""
+    """Run `code` in a Python with only these variables for OpenGL."""
     head = (
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
@@ -46,14 +46,14 @@ SHOWN = replace(H100, index=2, cuda_id=3)
 @pytest.mark.parametrize(
     ("devices", "gpu", "expected"),
     [
-        # The one that has a number for CUDA, wherever it is in EGL's list; the number
-        # may count all GPUs, or those that are shown.
+        # CUDA's number identifies it anywhere in EGL's list; the number
+        # may count all GPUs or only visible ones.
         ([H100], "0", H100),
         ([LLVMPIPE, OTHER, SHOWN], "0", SHOWN),
-        # EGL tells UUIDs also where CUDA shows nothing; the beginning is enough.
+        # EGL knows UUIDs even if CUDA shows nothing; a prefix is enough.
         ([HIDDEN, OTHER], OTHER.uuid, OTHER),
         ([HIDDEN, OTHER], "GPU-F3544F26", HIDDEN),
-        # Where none or several would do, it is none.
+        # No device, or several, match.
         ([], "0", None),
         ([LLVMPIPE], "0", None),
         ([HIDDEN, OTHER], "GPU-", None),
@@ -61,50 +61,41 @@ SHOWN = replace(H100, index=2, cuda_id=3)
         ([H100, replace(H100, index=1)], "0", None),
     ],
 )
-def test_egls_device_of_a_gpu(devices, gpu, expected):
-    """It is found by CUDA's number or the UUID, and never guessed."""
+def test_egl_device_is_found_by_cuda_number_or_uuid(devices, gpu, expected):
     assert device_of_gpu(devices, gpu) is expected
 
 
-def test_visible_gpus(tmp_path):
-    """As CUDA reads its variable, up to the first entry that it does not understand.
-
-    Without it, it counts those that may be opened, whatever their files are called.
-    """
-    for text, expected in {
-        " 2 , GPU-1a2b ": ["2", "GPU-1a2b"],
-        "": [],
-        "-1": [],
-        "0,-1,2": ["0"],
-    }.items():
+def test_visible_gpus_are_those_of_cudas_variable_or_openable_files(tmp_path):
+    """CUDA reads the variable up to the first invalid entry."""
+    cases = {" 2 , GPU-1a2b ": ["2", "GPU-1a2b"], "": [], "-1": [], "0,-1,2": ["0"]}
+    for text, expected in cases.items():
         assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
     for name in ("nvidia2", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
         (tmp_path / name).touch()
-    # Nobody may open a directory for writing, as nobody a GPU that is not granted.
+    # A directory cannot be opened for writing, like a GPU that is not granted.
     (tmp_path / "nvidia6").mkdir()
     assert visible_gpus({}, devices=tmp_path) == ["0", "1"]
     assert visible_gpus({}, devices=tmp_path / "none") == []
 
 
 @pytest.mark.parametrize("gpu", ["", "cuda:0", "0,1", "GPU-1,GPU-2", "-1"])
-def test_what_is_no_entry_is_refused(gpu):
-    """Before anything is tried."""
+def test_invalid_gpus_are_rejected(gpu):
     with pytest.raises(InvalidArgument, match="CUDA_VISIBLE_DEVICES"):
         render_on_given_gpu(gpu)
 
 
 @pytest.mark.parametrize(
-    ("gpu", "variables", "said"),
+    ("gpu", "variables", "message"),
     [
         ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was not assigned a GPU"),
         ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was not assigned a GPU"),
-        # `MUJOCO_GL` stands, and what that means is said.
+        # `MUJOCO_GL` takes precedence, with a warning.
         ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was assigned for rendering, but"),
         ("'77'", {}, r"GPU 77 was assigned for rendering, but (EGL has only|none of)"),
     ],
 )
-def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
-    """No variable changes; it is an error where the GPU is required."""
+def test_unusable_gpu_is_a_warning_or_an_error_if_required(gpu, variables, message):
+    """No variable changes."""
     done = run(
         f"before = dict(os.environ)\nassert render_on_given_gpu({gpu}) is None\n"
         f"assert dict(os.environ) == before\n"
@@ -112,17 +103,14 @@ def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
         **variables,
     )
     assert done.stderr.count("WARNING") == 1
-    assert re.search(f"WARNING:mjrec.gl.devices:{said}", done.stderr)
-    assert re.search(f"GLError: {said}", done.stderr)
+    assert re.search(f"WARNING:mjrec.gl.devices:{message}", done.stderr)
+    assert re.search(f"GLError: {message}", done.stderr)
 
 
 @pytest.mark.skipif("not has_gpu()", reason="EGL can draw on no GPU here")
-@pytest.mark.parametrize(
-    "name", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]]
-)
-def test_the_given_gpu_draws(name):
-    """By its number and by its UUID; mujoco then draws on that device."""
-    gpu = name(next(d for d in probe("egl").devices if d.cuda_id == 0))
+@pytest.mark.parametrize("key", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]])
+def test_mujoco_draws_on_the_given_gpu(key):
+    gpu = key(next(d for d in probe("egl").devices if d.cuda_id == 0))
     done = run(
         f"device = render_on_given_gpu({gpu!r}, required=True)\n"
         "import mujoco\n"

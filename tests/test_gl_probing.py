@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each known failure is brought about, in a child process, and explained."""
+"""Probes cause each known OpenGL failure in a child process and explain it."""
 
 import json
 import os
@@ -15,16 +15,16 @@ from mjrec.gl import choice
 from mjrec.gl.choice import Probe, probe, probe_environment
 from mjrec.simulation import gl_probe
 
+_VENDOR_FILES = "__EGL_VENDOR_LIBRARY_FILENAMES"
 _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
 def probe_with(backend, **variables):
-    """Probe with the test's environment, free of what chooses OpenGL, and these."""
+    """Probe with only these variables for OpenGL."""
     return probe_environment(without_gl(MUJOCO_GL=backend, **variables))
 
 
-def test_egl_renders_and_says_with_what(monkeypatch):
-    """A real frame, its speed, OpenGL's words and EGL's devices."""
+def test_egl_renders_and_reports_driver_speed_and_devices(monkeypatch):
     answer = probe("egl", measure=True)
     assert answer.renders, f"{answer.cause}\n{answer.fix}\n{answer.output}"
     assert answer.gl_renderer
@@ -33,7 +33,7 @@ def test_egl_renders_and_says_with_what(monkeypatch):
     assert answer.frames_per_second > 0
     assert [device.index for device in answer.devices] == [*range(len(answer.devices))]
     assert sum(device.in_use for device in answer.devices) == 1
-    # Asked again it starts no child process, unless a variable has changed.
+    # It remembers the answer until a variable changes.
     assert probe("egl") is probe("egl", measure=True) is answer
     monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
     assert not probe("egl").renders
@@ -43,31 +43,25 @@ def test_egl_renders_and_says_with_what(monkeypatch):
     ("backend", "variables", "cause", "fix"),
     [
         ("glfw", {"DISPLAY": ":77"}, "cannot open :77", "MUJOCO_GL to egl"),
-        (
-            "egl",
-            {"MUJOCO_EGL_DEVICE_ID": "99"},
-            "MUJOCO_EGL_DEVICE_ID=99, but EGL sees",
-            "Set MUJOCO_EGL_DEVICE_ID to",
-        ),
         ("off", {}, "MUJOCO_GL=off turns rendering off", "Unset MUJOCO_GL"),
         (
-            "egl",
-            {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"},
-            "only in __EGL_VENDOR_LIBRARY_FILENAMES (/nonexistent)",
-            "unset __EGL_VENDOR_LIBRARY_FILENAMES",
+            *("egl", {"MUJOCO_EGL_DEVICE_ID": "99"}),
+            *("MUJOCO_EGL_DEVICE_ID=99, but EGL sees", "Set MUJOCO_EGL_DEVICE_ID to"),
+        ),
+        (
+            *("egl", {_VENDOR_FILES: "/nonexistent"}),
+            *(f"only in {_VENDOR_FILES} (/nonexistent)", f"unset {_VENDOR_FILES}"),
         ),
     ],
 )
-def test_variables_that_keep_a_backend_from_rendering(backend, variables, cause, fix):
-    """The variable is named, and what to do about it."""
+def test_variables_that_prevent_rendering_are_named(backend, variables, cause, fix):
     answer = probe_with(backend, **variables)
     assert not answer.renders
     assert cause in answer.cause
     assert fix in answer.fix
 
 
-def test_driver_that_draws_nothing():
-    """A context that can be made is not enough: the frame is looked at."""
+def test_driver_that_draws_nothing_fails():
     usual = probe("egl")
     if not usual.software:
         pytest.skip(f"only Mesa can be told to draw nothing, not {usual.gl_renderer}")
@@ -83,21 +77,20 @@ DEAF = "import signal; signal.pthread_sigmask(0, range(1, 64)); signal.pause()"
     ("code", "timeout", "cause"),
     [
         ("import ctypes; ctypes.string_at(0)", 120, "The driver crashed (SIGSEGV)"),
-        # What nobody has explained yet is shown as it was said.
+        # An unknown message is shown unchanged.
         ("raise SystemExit('the moon is in another quarter')", 120, "the moon is in"),
         (DEAF, 0.2, "The driver hangs"),
     ],
 )
-def test_the_end_of_the_child_is_an_answer(tmp_path, code, timeout, cause, monkeypatch):
-    """A crash ends the child only; one that is deaf to other signals is killed."""
+def test_end_of_the_child_is_explained(tmp_path, code, timeout, cause, monkeypatch):
+    """A child that ignores other signals is killed."""
     (tmp_path / "sitecustomize.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=timeout)
     assert cause in answer.cause
 
 
-def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
-    """A GPU that is not used is named; without one there is nothing to say."""
+def test_software_rendering_beside_a_gpu_is_a_warning(tmp_path, monkeypatch):
     software = Probe("egl", renders=True, gl_renderer="llvmpipe (LLVM 15)")
     hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
     assert (software.software, hardware.software) == (True, False)
@@ -106,17 +99,14 @@ def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
     device = tmp_path / "nvidia0"
     device.touch()
     monkeypatch.setattr(choice, "gpu_device_files", lambda: [str(device)])
-    said = software.warning()
-    assert "llvmpipe (LLVM 15)" in said
-    assert str(device) in said
+    warning = software.warning()
+    assert "llvmpipe (LLVM 15)" in warning
+    assert str(device) in warning
     assert hardware.warning() == ""
 
 
-# --- What a frame must show -------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (np.zeros_like, r"Every pixel of the frame is \(0, 0, 0\)"),
         (lambda p: p[:, ::-1], "red on the left"),
@@ -124,22 +114,17 @@ def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
     ],
     ids=["black", "mirrored", "noise"],
 )
-def test_a_bad_frame_is_found_out(spoil, said):
-    """A context that works and a frame that is wrong is a failure."""
+def test_wrong_frames_are_failures(spoil, message):
     frame = np.full((480, 480, 3), 60, np.uint8)
     frame[250:350, 50:160] = (255, 0, 0)
     frame[250:350, 320:430] = (0, 0, 255)
     frame[125:210, 200:280] = (0, 255, 0)
     gl_probe.check_frame(frame)
-    with pytest.raises(gl_probe.WrongFrame, match=said):
+    with pytest.raises(gl_probe.WrongFrame, match=message):
         gl_probe.check_frame(spoil(frame))
 
 
-# --- Libraries that are not there ---------------------------------------------------
-#
-# In a mount namespace of its own, the system's library directory is one of links to
-# all that is in it but what is hidden.
-
+# In a mount namespace, links to all but the hidden libraries replace the directory.
 _LIBRARIES = Path("/usr/lib", sysconfig.get_config_var("MULTIARCH") or "nowhere")
 _VENDORS = "/usr/share/glvnd/egl_vendor.d"
 _HIDE = r"""
@@ -149,12 +134,8 @@ shift 5
 mkdir "$place/all" "$place/view" "$place/empty"
 mount --rbind "$libraries" "$place/all"
 cd "$place/view"
-ls -A "$place/all" | while read -r name; do
-  for pattern in $hidden; do
-    case $name in $pattern) continue 2;; esac
-  done
-  printf '%s\0' "$place/all/$name"
-done | xargs -0 ln -s -t .
+ln -s "$place"/all/* .
+rm -f -- $hidden
 [ -z "$added" ] || touch "$added"
 mount --bind "$place/view" "$libraries"
 [ -z "$vendors" ] || mount --bind "$place/empty" "$vendors"
@@ -170,7 +151,7 @@ print(json.dumps(dataclasses.asdict(probe(sys.argv[1]))))
 
 @pytest.fixture(scope="module")
 def namespaces():
-    """`unshare`, where this user may have mount namespaces."""
+    """Return `unshare`, if this user may have mount namespaces."""
     tried = subprocess.run(
         "unshare -Urm mount --bind /usr /usr", shell=True, capture_output=True
     )
@@ -187,18 +168,19 @@ def namespaces():
         ("egl", "libEGL.so*", "", "", ["EGL's library, libEGL.so.1, is not"]),
         ("egl", "libEGL_mesa.so*", "", "", ["libEGL_mesa.so.0, named in"]),
         ("egl", "", "", _VENDORS, ["without a driver"]),
-        # Mesa's drivers; since 24.2 they are one library that EGL's needs.
+        # Mesa's drivers, since 24.2 one library that EGL's needs.
         (
             *("egl", "dri libgallium-*", "", ""),
             ["Mesa's driver swrast is not installed", "libEGL_mesa.so.0, named in"],
         ),
         ("osmesa", "libOSMesa.so*", "", "", ["OSMesa's library, libOSMesa.so.8, is"]),
-        # Mesa 25.1.3 has none any more.
+        # Mesa 25.1.3 has no OSMesa.
         ("osmesa", "libOSMesa.so*", "libgallium-25.1.3-1.so", "", ["has no OSMesa"]),
     ],
 )
-def test_missing_library(namespaces, backend, hidden, added, vendors, causes, tmp_path):
-    """What is missing is named, and the packages that bring it."""
+def test_missing_library_is_named_with_its_packages(
+    namespaces, backend, hidden, added, vendors, causes, tmp_path
+):
     hide = [str(_LIBRARIES), str(tmp_path), vendors, hidden, added]
     under = [namespaces, "-Urm", "bash", "-c", _HIDE, "hide", *hide]
     answer = json.loads(run_python(_PROBE, backend, under=under).stdout)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The small modules at the bottom: JSON, files that appear whole, frames, errors."""
+"""Small modules that all others use: JSON, atomic files, frames, errors."""
 
 import json
 import math
@@ -28,35 +28,32 @@ LOOP.append(LOOP)
         ((np.arange(3), 0.1), "[[0, 1, 2], 0.1]"),
         ({1: 2, None: np.int64(3)}, '{"1": 2, "null": 3}'),
         ([math.nan, np.float32("nan")], "[null, null]"),
-        # What JSON reads as infinity; strings that say so stay strings.
+        # JSON parsers read 1e999 as infinity; strings stay strings.
         ([math.inf, -math.inf, "Infinity"], '[1e999, -1e999, "Infinity"]'),
-        # What is noted for people never stops a run.
+        # Facts for people never stop a run.
         ({"a": Path("x")}, '{"a": {"repr": "PosixPath(\'x\')"}}'),
         (LOOP, '[{"repr": "[[...]]"}]'),
     ],
 )
-def test_json_is_what_every_reader_accepts(value, text):
-    """NumPy's numbers, NaN and infinity, and what JSON does not know."""
+def test_json_is_valid_for_numpy_nan_and_unknown_values(value, text):
     assert dumps(value) == text
     json.loads(text, parse_constant=pytest.fail)
 
 
-def test_nan_comes_back():
-    """Also from gym's own token."""
+def test_nan_and_infinity_are_read_back():
     assert math.isnan(float_from_json(None))
     assert repr(loads("[NaN, -Infinity, 1e999]")) == "[nan, -inf, inf]"
 
 
-def test_a_file_appears_whole_or_not_at_all(tmp_path):
-    """A failure leaves the old one, and no temporary one."""
+def test_file_appears_whole_or_not_at_all(tmp_path):
+    """A failure leaves the old file and no temporary one."""
     path = tmp_path / "openaigym.video.0.7.video000015.mp4"
     with replacing(path) as temporary:
         temporary.write_text("half")
         assert not path.exists()
-        assert re.fullmatch(
-            rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.part", temporary.name
-        )
-        # Or nobody would remove what a killed process has left of it.
+        hidden = rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.part"
+        assert re.fullmatch(hidden, temporary.name)
+        # The infix lets cleanup find the leftovers of a killed process.
         assert infix_of(temporary.name) == "0.7"
     write_text(path, "old")
     # The last character cannot be written.
@@ -73,21 +70,18 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path):
         *(np.zeros((2, 2, 4), np.uint8), np.zeros((0, 2, 3), np.uint8)),
     ],
 )
-def test_what_is_no_frame_is_said(bad):
-    """The error says what it is and what it should be."""
+def test_invalid_frames_are_errors(bad):
     with pytest.raises(InvalidFrame, match="must"):
         check_frame(bad)
 
 
 @pytest.mark.parametrize("size", [(0, 1), (1.5, 2), (True, 2), (1, 99999)])
-def test_impossible_sizes_are_an_error(size):
-    """It names the side."""
+def test_impossible_sizes_are_errors(size):
     with pytest.raises(InvalidArgument, match=r"height|width"):
         check_size(*size)
 
 
-def test_a_grid_is_as_square_as_can_be():
-    """Every frame is in its place, row by row; nothing is scaled to fit."""
+def test_grid_is_nearly_square_and_scales_nothing():
     for count in range(1, 40):
         rows, columns = grid_shape(count)
         assert rows * columns >= count > (rows - 1) * columns
@@ -100,8 +94,7 @@ def test_a_grid_is_as_square_as_can_be():
         grid_frame([frames[0], np.zeros((5, 4, 3), np.uint8)])
 
 
-def test_long_lists_in_errors_are_shortened():
-    """A few names are all listed; of many, those that look alike."""
+def test_long_lists_in_errors_are_shortened_to_similar_names():
     assert "Available: side, top." in str(UnknownName("camera", "sid", ["side", "top"]))
     many = [f"Env-v{n}" for n in range(50)]
     assert "Similar names: Env-v3" in str(UnknownName("environment", "env-v3", many))
@@ -117,7 +110,7 @@ ERRORS = [
     mjrec.ExistingRecordings(Path("d"), ["a"]),
     mjrec.DirectoryNotWritable(Path("d"), "why"),
     mjrec.DifferentEnvironment(Path("d"), "a", "b"),
-    mjrec.EncoderError("what", command=["ffmpeg"], returncode=1, stderr="said"),
+    mjrec.EncoderError("what", command=["ffmpeg"], returncode=1, stderr="why"),
     mjrec.UnreadableFile(Path("f"), "why"),
     mjrec.MissingDependency("p", purpose="x", install="pip install p"),
     mjrec.EnvironmentNotMade("e", "why"),
@@ -126,8 +119,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-def test_errors_come_home_from_other_processes(error):
-    """They survive pickling, message and facts."""
-    again = pickle.loads(pickle.dumps(error))
-    assert (type(again), str(again)) == (type(error), str(error))
-    assert vars(again) == vars(error)
+def test_errors_survive_pickling_with_all_facts(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert (type(copy), str(copy)) == (type(error), str(error))
+    assert vars(copy) == vars(error)

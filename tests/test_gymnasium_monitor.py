@@ -17,13 +17,12 @@ BAR = [4, 8, 12, 16]
 
 
 def shown(directory, episode):
-    """Return how long the corridor's bar is in each frame of a video."""
+    """Return the length of the corridor's bar in each frame of a video."""
     frames = frames_in(directory, episode)
     return [int((frame[0, :, 0] > 128).sum()) for frame in frames]
 
 
-def test_records_the_scheduled_episodes(corridor, tmp_path, play, names, caplog):
-    """Of ten episodes 0, 1 and 8 have a video; statistics and manifest are gym's."""
+def test_records_scheduled_episodes(corridor, tmp_path, play, names, caplog):
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 10)
     assert videos_in(tmp_path) == [0, 1, 8]
@@ -34,17 +33,16 @@ def test_records_the_scheduled_episodes(corridor, tmp_path, play, names, caplog)
     env_info = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
     assert manifest["env_info"] == env_info
     assert "no spec" in caplog.text
-    assert all(
-        (tmp_path / name).is_file() for pair in manifest["videos"] for name in pair
-    )
+    for pair in manifest["videos"]:
+        assert all((tmp_path / name).is_file() for name in pair)
     schedule = manifest["mjrec"]["schedule"]
     assert schedule == {"name": "capped_cubic_video_schedule", "recorded": [0, 1, 8]}
     # No lock and no temporary file stays.
     assert [name for name in names(tmp_path) if name.startswith(".")] == []
 
 
-def test_video_and_its_metadata(make_corridor, tmp_path, play):
-    """N + 1 frames of n steps and their facts; a close in mid-episode keeps them."""
+def test_video_has_n_plus_1_frames_and_metadata(make_corridor, tmp_path, play):
+    """A close within an episode keeps its frames."""
     listed = []
 
     class Watching(make_corridor):
@@ -61,7 +59,7 @@ def test_video_and_its_metadata(make_corridor, tmp_path, play):
     env.close()
     env.close()
     assert listed == [True]
-    # After close nothing counts; total steps cover the unfinished episode.
+    # Nothing counts after close; total steps include the unfinished episode.
     env.reset()
     env.step(0)
     assert (env.episode_id, env.get_total_steps()) == (2, 4)
@@ -81,18 +79,15 @@ def test_video_and_its_metadata(make_corridor, tmp_path, play):
 
 
 @pytest.mark.parametrize("pop_frames", [True, False])
-def test_frame_collections_lose_and_double_nothing(
-    corridor, tmp_path, play, pop_frames
-):
-    """Whether or not RenderCollection forgets the frames it has given."""
+def test_frame_collections_keep_each_frame_once(corridor, tmp_path, play, pop_frames):
     env = gymnasium.wrappers.RenderCollection(corridor, pop_frames=pop_frames)
     with mjrec.Monitor(env, tmp_path) as env:
         play(env, 2)
     assert shown(tmp_path, 0) == shown(tmp_path, 1) == BAR
 
 
-def test_write_upon_reset_writes_at_each_reset(make_corridor, tmp_path, play):
-    """Before the monitor closes; without videos no render mode is needed."""
+def test_write_upon_reset_writes_results_at_each_reset(make_corridor, tmp_path, play):
+    """Without videos it needs no render mode."""
     corridor = make_corridor(render_mode=None)
     with mjrec.Monitor(corridor, tmp_path, False, write_upon_reset=True) as env:
         play(env, 2)
@@ -101,8 +96,8 @@ def test_write_upon_reset_writes_at_each_reset(make_corridor, tmp_path, play):
         assert manifest_of(tmp_path)["stats"]
 
 
-def test_wrong_use_is_refused(corridor, tmp_path, play):
-    """The environment is neither stepped nor reset, and the episode can go on."""
+def test_steps_and_resets_out_of_order_are_errors(corridor, tmp_path, play):
+    """The environment is not called, and the episode can go on."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         with pytest.raises(ResetNeeded, match="before the first reset"):
             env.step(0)
@@ -121,8 +116,8 @@ def test_wrong_use_is_refused(corridor, tmp_path, play):
     assert shown(tmp_path, 0) == BAR
 
 
-def test_the_schedule_is_asked_once_for_each_number(corridor, tmp_path, play):
-    """A reset before any step keeps it and replaces the frame; truth counts."""
+def test_schedule_is_called_once_per_episode(corridor, tmp_path, play):
+    """A second reset before any step replaces the frame."""
     asked = []
 
     def even(episode_id):
@@ -142,18 +137,17 @@ def test_the_schedule_is_asked_once_for_each_number(corridor, tmp_path, play):
     assert schedule["recorded"] == [0, 2]
 
 
-def test_check_env_passes(tmp_path):
-    """Gymnasium's own checker accepts the monitor where early resets are allowed."""
+def test_gymnasiums_checker_accepts_the_monitor(tmp_path):
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
     monitor = mjrec.Monitor(env, tmp_path, video_callable=False, allow_early_reset=True)
     with warnings.catch_warnings():
-        # It warns of every wrapper, and of HalfCheetah's own unbounded spaces.
+        # It warns of wrappers, and of HalfCheetah's unbounded spaces.
         warnings.simplefilter("ignore")
         check_env(monitor, skip_render_check=True)
 
 
-def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_path):
-    """In the step after the end; in that of the end, as gym's own, a frame is lost."""
+def test_automatic_resets_begin_episodes(make_corridor, tmp_path):
+    """A reset within the last step, as in gym, loses a frame."""
 
     class Looping(make_corridor):
         metadata = make_corridor.metadata | {"semantics.autoreset": True}
@@ -164,10 +158,8 @@ def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_pa
                 self.reset()
             return result
 
-    for env, steps, bar in (
-        (gymnasium.wrappers.Autoreset(make_corridor()), 7, BAR),
-        (Looping(), 6, BAR[:3]),
-    ):
+    autoreset = gymnasium.wrappers.Autoreset(make_corridor())
+    for env, steps, bar in ((autoreset, 7, BAR), (Looping(), 6, BAR[:3])):
         with mjrec.Monitor(env, tmp_path, lambda _: True, force=True) as monitor:
             monitor.reset()
             for _ in range(steps):
@@ -178,8 +170,8 @@ def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_pa
 
 
 @pytest.mark.parametrize("thread", ["main", "mjrec-encoder"])
-def test_garbage_collection_closes(corridor, tmp_path, play, thread):
-    """A forgotten monitor writes its results; never on a thread that it waits for."""
+def test_garbage_collection_closes_the_monitor(corridor, tmp_path, play, thread):
+    """It never closes on a thread that close waits for."""
     holder = [mjrec.Monitor(corridor, tmp_path)]
     play(holder[0], 1)
     collector = threading.Thread(target=holder.clear, name=thread)
@@ -192,9 +184,7 @@ def test_garbage_collection_closes(corridor, tmp_path, play, thread):
     assert corridor.closed == 1
 
 
-def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
-    """The error goes through; the episode goes on, or is complete."""
-
+def test_failing_frame_is_left_out_and_its_error_raised(make_corridor, tmp_path):
     class Blinking(make_corridor):
         def render(self):
             if self.position in (2, 5):
@@ -213,11 +203,7 @@ def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
     assert stats_of(tmp_path)["episode_lengths"] == [5]
 
 
-def test_users_exception_is_not_hidden_by_a_failing_close(
-    make_corridor, tmp_path, kill_ffmpeg
-):
-    """The encoder's failure is a note on it."""
-
+def test_failing_close_is_a_note_on_the_exception(make_corridor, tmp_path, kill_ffmpeg):
     def fail():
         with mjrec.Monitor(make_corridor(length=9), tmp_path) as env:
             env.reset()
@@ -230,11 +216,7 @@ def test_users_exception_is_not_hidden_by_a_failing_close(
     assert "ffmpeg" in raised.value.__notes__[0]
 
 
-# --- `episode_info=True`, and what is known of success --------------------------------
-
-
-def last_info(env):
-    """Run CartPole to its end; return the info of every step."""
+def infos_of(env):
     env.reset(seed=3)
     infos, done = [], False
     while not done:
@@ -249,12 +231,11 @@ def monitor(directory, env=None, **options):
     return mjrec.Monitor(made, directory, video_callable=False, **options)
 
 
-def test_last_step_has_what_gymnasium_gives(tmp_path):
-    """Keys, types and values are those of RecordEpisodeStatistics; its own stay."""
+def test_episode_info_equals_record_episode_statistics(tmp_path):
     theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
-    expected = last_info(theirs)[-1]["episode"]
+    expected = infos_of(theirs)[-1]["episode"]
     with monitor(tmp_path, episode_info=True) as env:
-        *before, last = last_info(env)
+        *before, last = infos_of(env)
     assert not any("episode" in info for info in before)
     episode = last["episode"]
     assert list(episode) == list(expected) == ["r", "l", "t"]
@@ -262,9 +243,9 @@ def test_last_step_has_what_gymnasium_gives(tmp_path):
     assert 0 < episode["t"] < 60
     # Gymnasium's own asserts that the key is absent: it is off by default.
     with monitor(tmp_path / "off") as env:
-        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
+        assert infos_of(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
     with monitor(tmp_path / "around", theirs, episode_info=True) as env:
-        episode = last_info(env)[-1]["episode"]
+        episode = infos_of(env)[-1]["episode"]
     assert episode["t"] == theirs.time_queue[-1]
 
 
@@ -280,6 +261,6 @@ def test_last_step_has_what_gymnasium_gives(tmp_path):
         ({"success": np.zeros(2)}, None),
     ],
 )
-def test_success_is_what_the_info_says(info, expected):
-    """Under either name; what is no truth value says nothing."""
+def test_success_comes_from_the_info(info, expected):
+    """Values without a truth value are ignored."""
     assert success_in(info) is expected

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of Gymnasium environments: whose frames follow from states."""
+"""Gymnasium environments whose frames can be drawn from states, and obstacles."""
 
 import functools
 import json
@@ -38,7 +38,7 @@ class Overlay(gymnasium.Wrapper):
         return super().render() // 2
 
 
-class OverlayBelow(Overlay):
+class Below(Overlay):
     pass
 
 
@@ -52,29 +52,31 @@ class Renderer(MujocoRenderer):
 
 
 def changed(env, part, **values):
-    """Change attributes of the environment or a part of it; return the environment."""
+    """Set attributes of the environment or of a part; return the environment."""
     for name, value in values.items():
         setattr(operator.attrgetter(part)(env) if part else env, name, value)
     return env
 
 
-def test_wrappers_that_show_what_is_inside_are_no_obstacle():
-    """Those of gymnasium.make, and most of Gymnasium's others."""
+def test_most_wrappers_of_gymnasium_are_no_obstacle():
+    """With a requested view, no wrapper is one."""
     env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(make()))
     env = wrappers.NormalizeReward(wrappers.Autoreset(env))
     assert gymnasium_scenes(env).obstacle is None
     assert gymnasium_scenes(make(render_mode=None)).obstacle is None
+    for asked in ({"camera": -1}, {"height": 32}, {"width": 32}):
+        assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
 
 
 OBSTACLES = [
-    # Wherever they are in the chain; the class that overrides is what is named.
+    # The obstacle names the overriding class, anywhere in the chain.
     (
-        lambda: gymnasium.Wrapper(OverlayBelow(make())),
+        lambda: gymnasium.Wrapper(Below(make())),
         f"wrapper {__name__}.Overlay overrides",
     ),
     (lambda: wrappers.RenderCollection(make()), "rendering.RenderCollection overrides"),
     (lambda: changed(make(), "", render=print), "TimeLimit overrides"),
-    # It shows another.
+    # It draws another environment.
     (lambda: changed(make(), "", render=make().render), "TimeLimit overrides"),
     (
         lambda: changed(make(), "unwrapped", render=make().unwrapped.render),
@@ -94,13 +96,12 @@ OBSTACLES = [
 
 
 @pytest.mark.parametrize(("made", "words"), OBSTACLES)
-def test_what_draws_something_else_is_named(made, words):
-    """A wrapper, a class, a method of one object, a mode, a renderer."""
+def test_overridden_rendering_is_a_named_obstacle(made, words):
     assert words in gymnasium_scenes(made()).obstacle
 
 
-def test_a_patched_class_is_an_obstacle(monkeypatch):
-    """A function in the place of Gymnasium's, even if it copies all names."""
+def test_patched_render_method_is_an_obstacle(monkeypatch):
+    """Even if it copies the name of Gymnasium's."""
     original = MujocoEnv.render
 
     @functools.wraps(original)
@@ -129,8 +130,8 @@ viewer_of = operator.attrgetter(VIEWER)
         ),
     ],
 )
-def test_what_is_added_in_the_viewer_is_a_momentary_obstacle(change, words):
-    """It is in env.render() and not in the scene; and so is an old model."""
+def test_additions_to_the_viewer_are_momentary_obstacles(change, words):
+    """`env.render()` shows them, and the scene does not."""
     env = make()
     scene = scene_of(env)
     assert scene.obstacle() is None
@@ -141,14 +142,7 @@ def test_what_is_added_in_the_viewer_is_a_momentary_obstacle(change, words):
     env.close()
 
 
-@pytest.mark.parametrize("asked", [{"camera": -1}, {"height": 32}, {"width": 32}])
-def test_a_view_that_was_asked_for_is_of_the_scene(asked):
-    """What wrappers draw is not in it, live or later."""
-    assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
-
-
-def test_another_renderer_has_another_camera():
-    """It is shown as if the environment were new, at once."""
+def test_replaced_renderer_replaces_camera_and_options():
     env = make("HalfCheetah-v5")
     scene = scene_of(env)
     view = scene()
@@ -162,8 +156,8 @@ def test_another_renderer_has_another_camera():
     assert view.option.flags[0] == 1
 
 
-def test_camera_that_was_asked_for():
-    """A name, the free camera where the model has it, or an MjvCamera; checked soon."""
+def test_requested_camera_is_a_name_a_number_or_an_object():
+    """The free camera follows the model's defaults."""
     env = make("HalfCheetah-v5")
     view = scene_of(env, camera="track", height=32)()
     assert (view.camera.fixedcamid, view.label) == (0, "track")
@@ -182,8 +176,8 @@ def test_camera_that_was_asked_for():
         gymnasium_scenes(env, height=0)
 
 
-def test_what_makes_the_environment_again():
-    """Id, arguments that JSON can hold, the least limit, wrappers that do something."""
+def test_environment_facts_suffice_to_make_it_again():
+    """JSON arguments, the smallest step limit, and wrappers with an effect."""
     env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
     environment = gymnasium_scenes(env).environment
     assert environment["kwargs"]["healthy_z_range"] == [0.5, 2.5]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories with trajectories in them, written without a simulation.
+"""Builders of trajectories, without a simulation.
 
-Frame k of one is a grey frame of brightness `grey(k)`, which `Painter` draws from
-its snapshots, with a white pixel in a corner.
+Their frame k has the brightness `grey(k)` and a white pixel in a corner. `Painter`
+draws it from the snapshots.
 """
 
 import itertools
@@ -39,14 +39,14 @@ def grey(frame):
 
 
 class Painter:
-    """Draws frames of trajectories of this module, as `WorkerPool` would.
+    """Draws frames of trajectories of this module, in place of `WorkerPool`.
 
-    Those of a camera that was asked for are a little brighter; with `plain` the white
-    pixel is left out. `asked` and `tiles` tell of what was drawn, and `breaks_at` is
-    called before each frame, with trajectory, view and index.
+    Frames of a requested camera are a little brighter; `plain` leaves out the white
+    pixel. `asked` and `tiles` list the requests, and `breaks_at` is called before each
+    frame with trajectory, view and index.
     """
 
-    gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
+    gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as WorkerPool has it
 
     def __init__(self, size=(16, 24), *, plain=False):
         self.size = size
@@ -75,7 +75,7 @@ class Painter:
 
 
 def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
-    """Return what writes recordings beside those that others have written."""
+    """Return a writer of recordings, whose numbers follow existing ones."""
     used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
     return SpanLogs(
         directory,
@@ -87,7 +87,7 @@ def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
 
 
 def add_row(span, step, **values):
-    """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
+    """Add a row with these columns; a snapshot makes it a frame."""
     slot = span.make_room()
     known = ("reward", "terminated", "truncated", "is_step")
     commit = {key: values.pop(key) for key in known if key in values}
@@ -149,7 +149,7 @@ def write_log(
 
 
 def write_finished(directory, episode_id=0, **rest):
-    """Write the finished trajectory of an episode, and nothing else."""
+    """Write only the finished trajectory of an episode."""
     note_models([directory_digest(directory)])
     path = finish_trajectory(write_log(directory, episode_id, **rest))
     journal = directory / journal_name(rest.get("infix", INFIX))
@@ -162,7 +162,7 @@ def write_finished(directory, episode_id=0, **rest):
 
 
 def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
-    """Write the manifest of a closed monitor whose videos are all pending."""
+    """Write the manifest of a closed monitor with only pending videos."""
     path = directory / manifest_name(infix)
     pending = [
         {
