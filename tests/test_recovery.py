@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recovering a directory: processes are killed, and nothing of theirs is lost."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -295,6 +296,31 @@ def test_a_closed_monitors_logs_become_trajectories(tmp_path, halfcheetah):
     assert results_of(tmp_path) == before
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
     assert_in_order(tmp_path)
+
+
+def test_a_killed_deferred_run_keeps_its_provenance(tmp_path):
+    """Packages and the policy's digest, through recovering and rendering."""
+    policy = tmp_path / "policy.pt"
+    policy.write_bytes(b"weights")
+    directory = kill(
+        "import gymnasium\nfrom mjrec.provenance import look_around\n"
+        "env = gymnasium.make('InvertedPendulum-v5', max_episode_steps=2, width=48,"
+        f" height=32)\nenv = monitor(env, workers=0, policy_file={str(policy)!r})\n"
+        "look_around().found(wait=True)\nrun(env, 2)\nrun(env, 1)\ndie()",
+        tmp_path / "run",
+    )
+    recovery = mjrec.recover(directory)
+    assert "1 step, incomplete: killed" in str(recovery)
+    pending = manifest_of(directory)["mjrec"]["pending"]
+    assert [each["episode_id"] for each in pending] == [0, 1]
+    assert not mjrec.render_videos(directory, workers=1).failures
+    assert [len(frames_in(directory, number)) for number in (0, 1)] == [3, 2]
+    assert metadata_of(directory, 1)["reason"] == "killed"
+    provenance = manifest_of(directory)["mjrec"]["provenance"]
+    assert provenance["packages"]
+    digest = hashlib.sha256(b"weights").hexdigest()
+    assert provenance["policy"] == {"file": str(policy), "sha256": digest}
+    assert_in_order(directory)
 
 
 # --- journal and logs ----------------------------------------------------------------
