@@ -106,7 +106,7 @@ def finish_killed_monitor(
         if lock is None:
             return
         if was_killed:
-            report.note(path.name, "its monitor was killed")
+            report.note(path.name, "its monitor did not close")
         try:
             monitor.finish(is_behind=is_behind)
         except BaseException:
