@@ -234,6 +234,8 @@ def test_a_forked_child_that_ends_leaves_its_parents_recording_alone(ending, tmp
     assert len(hashes(tmp_path)) == 6
     [trajectory] = trajectories(tmp_path)
     assert (trajectory.facts["complete"], len(trajectory.rewards)) == (True, 5)
+    assert events_of(tmp_path, "cut") == []
+    assert len(events_of(tmp_path, "closed")) == 1
     infixes = {infix_of(path.name) for path in tmp_path.iterdir()}
     assert len(infixes - {None}) == 1
     assert not list(tmp_path.glob(".*"))
