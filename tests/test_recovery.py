@@ -216,6 +216,20 @@ def test_a_text_recording_that_was_cut_off_is_finished(tmp_path):
     assert_in_order(directory)
 
 
+def test_a_text_recording_without_metadata_gets_it(tmp_path):
+    """The process was killed when the file already had its final name."""
+    directory = kill(
+        "import mjrec.formats.video_sink as s\ns.write_metadata = lambda *_: die()"
+        "\nenv = monitor(Corridor(12, 'ansi'))\nrun(env)",
+        tmp_path / "run",
+    )
+    recovery = mjrec.recover(directory)
+    assert "video000000.json: 13 frames" in str(recovery)
+    metadata = metadata_of(directory, 0)
+    assert (metadata["complete"], metadata["frame_steps"]) == (True, [[0, 12]])
+    assert_in_order(directory)
+
+
 @pytest.mark.parametrize(
     ("options", "then", "is_fed"),
     [
