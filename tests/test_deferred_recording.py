@@ -18,8 +18,10 @@ import pytest
 from other_python import run_python
 from processes import children
 from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
+from waiting import wait_until
 
 import mjrec
+from mjrec.commands import main
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 
 SIZE = {"height": 48, "width": 64}
@@ -140,6 +142,47 @@ def test_trajectories_are_kept_as_asked(options, kept, filmed, tmp_path):
     assert asked == ([0, 1, 2] if callable(choose) else [])
     assert sorted(int(path.stem[-6:]) for path in tmp_path.glob("*.h5")) == kept
     assert videos_in(tmp_path) == filmed
+
+
+@pytest.mark.parametrize("way", ["close", "render", "recover"])
+def test_a_monitor_that_never_ends_is_left_alone(way, tmp_path):
+    """Whatever finishes another one's videos or states in the same directory."""
+
+    def own():
+        paths = [p for p in tmp_path.iterdir() if f".{living.infix}." in p.name]
+        return {path.name: path.read_bytes() for path in paths}
+
+    living = monitored(make(), tmp_path, workers=0)
+    steps(living, 2)
+    before = own()
+    env = monitored(make(), tmp_path, lambda _: True, resume=True)
+    steps(env, 2)
+    env.close(wait=way == "close")
+    if way == "render":
+        assert main(["render", str(tmp_path), "--workers", "1"]) == 0
+    if way == "recover":
+        assert mjrec.recover(tmp_path).open_monitors == (living.infix,)
+    assert len(list(tmp_path.glob("*.mp4"))) == (way != "recover")
+    assert env.infix in trajectory_in(tmp_path).path.name
+    assert own() == before
+    living.step([0.0])
+    living.close()
+    assert len(list(tmp_path.glob("*.h5"))) == 2
+
+
+def test_the_same_workers_draw_one_video_after_another(tmp_path):
+    """They stay until the monitor closes."""
+    before, seen = children(), []
+    env = make(max_episode_steps=2)
+    with monitored(env, tmp_path, lambda _: True, workers=2) as env:
+        for number in range(3):
+            steps(env, 2)
+            wait_until(lambda: len(list(tmp_path.glob("*.meta.json"))) > number)  # noqa: B023  called at once
+            [process] = children() - before
+            seen.append(children(process))
+    assert videos_in(tmp_path) == [0, 1, 2]
+    assert len(seen[0]) == 2
+    assert seen == [seen[0]] * 3
 
 
 @pytest.mark.parametrize("way", ["exception", "wait=False", "collector"])

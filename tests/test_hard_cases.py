@@ -20,6 +20,7 @@ from robots import robots_that_reset
 
 import mjrec
 from mjrec.commands import main
+from mjrec.formats.monitor_directory import infix_of
 
 SIZE = {"height": 32, "width": 48}
 
@@ -209,6 +210,37 @@ def test_a_fork_in_mid_episode(tmp_path):
     assert len(hashes(tmp_path)) == 6
 
 
+FORK = """
+import os, sys, gymnasium, mjrec
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=5, height=32, width=48)
+env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=1)
+env.reset(seed=0)
+env.step([0.0])
+if child := os.fork():
+    assert os.waitpid(child, 0)[1] == 0
+    for _ in range(4):
+        env.step([0.0])
+    env.close()
+else:
+    exec(sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("ending", ["pass", "sys.exit()", "os._exit(0)"])
+def test_a_forked_child_that_ends_leaves_its_parents_recording_alone(ending, tmp_path):
+    """Also the process that draws; the child has no file of its own."""
+    done = run_python(FORK, tmp_path, ending)
+    assert "gone" not in done.stderr
+    assert len(hashes(tmp_path)) == 6
+    [trajectory] = trajectories(tmp_path)
+    assert (trajectory.facts["complete"], len(trajectory.rewards)) == (True, 5)
+    assert events_of(tmp_path, "cut") == []
+    assert len(events_of(tmp_path, "closed")) == 1
+    infixes = {infix_of(path.name) for path in tmp_path.iterdir()}
+    assert len(infixes - {None}) == 1
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_run_that_another_machine_renders(tmp_path, monkeypatch):
     """`close(wait=False)` draws and converts nothing; a copy of what it left does."""
     seen = []
@@ -234,16 +266,18 @@ for step in range(int(sys.argv[2])):
         env.unwrapped.set_state(*start)
     env.step(action)
 env.close()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
+    print(resource.getrusage(whose).ru_maxrss)
 """
 
 
 # Takes more than five seconds: a million steps.
 @pytest.mark.thorough
 def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path):
-    """Neither while it is recorded nor while its file is written."""
+    """Where it is recorded; the child that writes its file needs a few bytes a step."""
     few, many = (
-        int(run_python(MILLION, tmp_path / str(steps), steps).stdout) << 10
+        run_python(MILLION, tmp_path / str(steps), steps, timeout=900).stdout.split()
         for steps in (10_000, 1_000_000)
     )
-    assert many - few < 32 << 20
+    here, child = (int(b) - int(a) for a, b in zip(few, many, strict=True))
+    assert (here < 32 << 10, child < 48 << 10) == (True, True), (few, many)

@@ -89,6 +89,8 @@ def test_cut_last_line_is_left_out(path, caplog):
         (b"\0\0\0\n", "not valid JSON"),
         (b'{"episode_id": "1"}\n', "it must be a whole number, not a string"),
         (b'{"episode_id": 1e99}\n', "too large for a count"),
+        (b'{"episode_id": 1, "episode_id": 2}\n', "the key 'episode_id' twice"),
+        (b'{"episode_id": NaN}\n', "'episode_id' is wrong"),
     ],
 )
 def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):

@@ -113,6 +113,25 @@ def test_worst_n_are_kept(tmp_path, mode):
     assert len(mjrec.load_results(tmp_path)["episode_lengths"]) == 8
 
 
+# Takes more than five seconds: a thousand episodes.
+@pytest.mark.thorough
+def test_a_thousand_episodes_take_the_disk_of_four(tmp_path):
+    """The disk holds the worst three so far and the running one."""
+    returns = [(1019 - number) // 20 for number in range(1000)]
+    in_logs = set()
+    with mjrec.Monitor(
+        pendulum(returns), tmp_path, keep="worst:3", workers=0
+    ) as monitor:
+        for number in range(1000):
+            monitor.reset(seed=0)
+            in_logs.add(len({p.stem for p in tmp_path.glob("openaigym.states.*")}))
+            finish_episode(monitor)
+            assert len(in_flight(tmp_path)) == min(number + 1, 3)
+    assert max(in_logs) == 4
+    assert numbers(tmp_path.glob("*.h5")) == [980, 981, 982]
+    assert not list(tmp_path.glob("openaigym.states.*"))
+
+
 @live_and_deferred
 def test_first_n_failures_are_kept(tmp_path, mode):
     """Each is drawn when it ends; after N, recording stops."""

@@ -6,6 +6,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import gymnasium
 import pytest
 from other_python import run_python
 from parts import parametrize
@@ -26,6 +27,14 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 import mjrec
 from processes import kill_self as die
 directory, place = sys.argv[1], sys.argv[2]
+
+def before(owner, name, when=lambda *_: True):
+    known = getattr(owner, name)
+    def function(*arguments, **options):
+        if when(*arguments):
+            die()
+        return known(*arguments, **options)
+    setattr(owner, name, function)
 
 """
 
@@ -64,6 +73,70 @@ finish.WorkerPool = lambda count, **rest: Painter()
 for result in finish.finish(Path(directory), workers=1):
     assert not result.failures, result
 """
+
+
+FINISH_REALLY = """
+from mjrec.formats import video_file, video_sink
+from mjrec.rendering import finish, pool
+
+def is_video(path, to):
+    return str(to).endswith(".mp4")
+
+owner, name, *when = {
+    "before the video's name": (Path, "replace", is_video),
+    "before drawing": (pool.WorkerPool, "frames"),
+    "while a worker draws": (video_sink.VideoSink, "write"),
+    "before ffmpeg's end": (video_file.Encoding, "finish"),
+    "between ffmpeg's end and the names": (video_file.Encoding, "_checked"),
+    "between the video's name and the metadata": (video_sink, "write_metadata"),
+    "before the manifest": (finish, "update_manifests"),
+}[place]
+before(owner, name, *when)
+list(finish.finish(Path(directory), workers=1))
+"""
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """A directory with a pending video, and a copy in which that is rendered."""
+    pending = tmp_path_factory.mktemp("rendered") / "pending"
+    env = gymnasium.make("InvertedPendulum-v5", height=32, width=48)
+    with mjrec.Monitor(env, pending, workers=0) as monitor:
+        monitor.reset(seed=0)
+        for _ in range(4):
+            monitor.step([0.0])
+    done = pending.with_name("done")
+    shutil.copytree(pending, done)
+    assert not mjrec.render_videos(done, workers=1).failures
+    return pending, done
+
+
+# Takes more than five seconds: two finishers with a worker each.
+@parametrize(
+    "place",
+    [
+        "before the video's name",
+        "before drawing",
+        "while a worker draws",
+        "before ffmpeg's end",
+        "between ffmpeg's end and the names",
+        "between the video's name and the metadata",
+        "before the manifest",
+    ],
+    part=pytest.mark.crashes,
+)
+def test_a_finisher_killed_beside_its_worker_is_taken_up_again(
+    place, tmp_path, rendered
+):
+    """The next one leaves every file as one that was never killed."""
+    pending, done = rendered
+    directory = tmp_path / "run"
+    shutil.copytree(pending, directory)
+    assert run(FINISH_REALLY, directory, place)
+    assert manifest_of(directory)["mjrec"]["pending"]
+    assert not mjrec.render_videos(directory, workers=1).failures
+    assert contents(directory) == contents(done)
+    assert manifest_of(done)["mjrec"]["pending"] == []
 
 
 EVERY_EIGHTH = [range(first, 100, 8) for first in range(8)]
@@ -171,14 +244,6 @@ from conftest import Corridor
 import mjrec.formats.row_log
 from mjrec.formats import video_file, video_metadata, video_sink
 from mjrec.formats.journal import JournalWriter
-
-def before(owner, name, when=lambda *_: True):
-    known = getattr(owner, name)
-    def function(*arguments, **options):
-        if when(*arguments):
-            die()
-        return known(*arguments, **options)
-    setattr(owner, name, function)
 
 def half_a_line(descriptor, line):
     if bytes(line).startswith(b'{"episode_id": 1,'):

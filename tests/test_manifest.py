@@ -33,6 +33,8 @@ STATS_TEXT = (
         (STATS_TEXT.replace("[3, 4]", "[3]"), "1 episode_lengths"),
         (STATS_TEXT.replace('["t", "e"]', '["t"]'), "1 episode_types for 2"),
         (STATS_TEXT.replace("1.5", "9" * 400), "too large for a float"),
+        ('{"stats": "s", "stats": "t"}', "the key 'stats' twice"),
+        ('{"stats": NaN, "videos": [], "env_info": {}}', "'stats' is wrong"),
         (None, "No such file"),
     ],
 )

@@ -80,27 +80,31 @@ def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
 
 
 CUT = """
-import os, sys
+import contextlib, os, sys
 import gymnasium, mjrec, numpy
 
-disk = sys.argv[1]
+disk, on_error = sys.argv[1:]
 env = gymnasium.make("HalfCheetah-v5", max_episode_steps=200)
-monitor = mjrec.Monitor(env, disk + "/run", lambda _: True, workers=0, on_error="warn")
+monitor = mjrec.Monitor(
+    env, disk + "/run", lambda _: True, workers=0, on_error=on_error
+)
 with open(disk + "/filler", "wb") as file:
     free = os.statvfs(disk)
     room = 400_000
     os.posix_fallocate(file.fileno(), 0, free.f_bavail * free.f_bsize - room)
 monitor.reset(seed=0)
 for _ in range(200):
-    monitor.step(numpy.ones(6, numpy.float32))
+    with contextlib.suppress(mjrec.FileNotWritten):
+        monitor.step(numpy.ones(6, numpy.float32))
 os.unlink(disk + "/filler")
 monitor.close(wait=False)
 """
 
 
-def test_a_trajectory_without_room_for_its_last_rows_ends_with_them(disk):
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_a_trajectory_without_room_for_its_last_rows_ends_with_them(on_error, disk):
     """Length and reward are those of its rows; the episode is counted as it was."""
-    run_python(CUT, disk)
+    run_python(CUT, disk, on_error)
     run = disk / "run"
     mjrec.recover(run)
     [path] = run.glob("*.h5")
@@ -113,3 +117,5 @@ def test_a_trajectory_without_room_for_its_last_rows_ends_with_them(disk):
     assert ".log" in facts["broken_reason"]
     assert "truncated" not in facts
     assert stats_of(run)["episode_lengths"] == [200]
+    faults = manifest_of(run)["mjrec"]["faults"]
+    assert "trajectory" in [fault["what"] for fault in faults]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recovering a directory: processes are killed, and nothing of theirs is lost."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -207,11 +208,25 @@ def test_a_text_recording_that_was_cut_off_is_finished(tmp_path):
     paths = sorted(directory.glob("*.video00000?.json"))
     whole, cut = (json.loads(path.read_text()) for path in paths)
     assert (cut.keys(), cut["stdout"]) == (whole.keys(), whole["stdout"][:8])
-    metadata = metadata_of(directory, 1)
+    metadata, known = metadata_of(directory, 1), metadata_of(directory, 0)
     assert (metadata["complete"], metadata["reason"]) == (False, "killed")
     assert (metadata["fps"], metadata["frame_steps"]) == ("10", [[0, 7]])
-    assert metadata["content_type"] == metadata_of(directory, 0)["content_type"]
+    assert known.keys() - metadata.keys() == {"terminated", "truncated"}
     assert "8 frames, incomplete: killed" in str(recovery)
+    assert_in_order(directory)
+
+
+def test_a_text_recording_without_metadata_gets_it(tmp_path):
+    """The process was killed when the file already had its final name."""
+    directory = kill(
+        "import mjrec.formats.video_sink as s\ns.write_metadata = lambda *_: die()"
+        "\nenv = monitor(Corridor(12, 'ansi'))\nrun(env)",
+        tmp_path / "run",
+    )
+    recovery = mjrec.recover(directory)
+    assert "video000000.json: 13 frames" in str(recovery)
+    metadata = metadata_of(directory, 0)
+    assert (metadata["complete"], metadata["frame_steps"]) == (True, [[0, 12]])
     assert_in_order(directory)
 
 
@@ -295,6 +310,31 @@ def test_a_closed_monitors_logs_become_trajectories(tmp_path, halfcheetah):
     assert results_of(tmp_path) == before
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
     assert_in_order(tmp_path)
+
+
+def test_a_killed_deferred_run_keeps_its_provenance(tmp_path):
+    """Packages and the policy's digest, through recovering and rendering."""
+    policy = tmp_path / "policy.pt"
+    policy.write_bytes(b"weights")
+    directory = kill(
+        "import gymnasium\nfrom mjrec.provenance import look_around\n"
+        "env = gymnasium.make('InvertedPendulum-v5', max_episode_steps=2, width=48,"
+        f" height=32)\nenv = monitor(env, workers=0, policy_file={str(policy)!r})\n"
+        "look_around().found(wait=True)\nrun(env, 2)\nrun(env, 1)\ndie()",
+        tmp_path / "run",
+    )
+    recovery = mjrec.recover(directory)
+    assert "1 step, incomplete: killed" in str(recovery)
+    pending = manifest_of(directory)["mjrec"]["pending"]
+    assert [each["episode_id"] for each in pending] == [0, 1]
+    assert not mjrec.render_videos(directory, workers=1).failures
+    assert [len(frames_in(directory, number)) for number in (0, 1)] == [3, 2]
+    assert metadata_of(directory, 1)["reason"] == "killed"
+    provenance = manifest_of(directory)["mjrec"]["provenance"]
+    assert provenance["packages"]
+    digest = hashlib.sha256(b"weights").hexdigest()
+    assert provenance["policy"] == {"file": str(policy), "sha256": digest}
+    assert_in_order(directory)
 
 
 # --- journal and logs ----------------------------------------------------------------

@@ -11,8 +11,7 @@ import tyro
 from ..evaluation.evaluation import is_evaluation
 from ..formats.json_fields import to_json
 from ..formats.monitor_directory import monitor_directories_in
-from ..rendering.leftovers import RecoveredFile
-from ..rendering.recovery import Recovery
+from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory
 from .options import AsJson
 from .terminal import FAILED, print_json, print_lines, result_console

@@ -25,7 +25,7 @@ from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
 from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
-from ..rendering.leftovers import has_leftovers
+from ..rendering.recovery_needed import needs_recovery
 from ..results.monitor_files import monitors_of
 from ..simulation.model_trust import note_models
 from .episode_results import ChunkResults, EpisodeResult, read_chunk
@@ -104,7 +104,7 @@ class ChunkRun:
     def is_finished(self) -> bool:
         """Whether the chunk is complete and its recordings are finished."""
         return self.is_complete and not any(
-            has_leftovers(files) for files in monitors_of(self.folder)
+            needs_recovery(files) for files in monitors_of(self.folder)
         )
 
     def result(self, unit: Unit) -> EpisodeResult:

@@ -53,9 +53,9 @@ from ..formats.monitor_directory import (
 from ..formats.regular_files import regular_path
 from ..formats.trajectory import row_dtype
 from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
-from ..rendering.leftovers import has_leftovers
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
+from ..rendering.recovery_needed import needs_recovery
 from ..results import iter_episodes
 from ..results.monitor_files import MonitorFiles, monitors_of
 from .bag import TRY_AGAIN
@@ -209,7 +209,7 @@ def _check_is_idle(directory: Path) -> None:
 
 def _check_all_is_done(directory: Path) -> None:
     monitors = list(monitors_of(directory))
-    killed = [each.infix for each in monitors if has_leftovers(each)]
+    killed = [each.infix for each in monitors if needs_recovery(each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
     lost = [each for each in monitors if each.manifest is None]

@@ -20,7 +20,6 @@ from typing import IO
 from ..atomic_files import temporary_path, writing
 from ..errors import InvalidFrame
 from ..json_text import loads
-from ..rates import rate_from_timestep
 from .json_fields import unreadable
 
 # The frames come first, one per line. The fields that depend on all frames follow.
@@ -120,8 +119,8 @@ class AsciicastWriter:
             self._file.close()
 
 
-def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
-    """Return the rate and the text frames of an unfinished recording.
+def unfinished_frames(path: Path) -> list[str]:
+    """Return the text frames of an unfinished recording.
 
     Args:
         path: the hidden file that a killed process left. An incomplete frame at its end
@@ -134,18 +133,17 @@ def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
         if not path.is_file() or path.is_symlink():
             raise ValueError("it is not a regular file")
         frames: list[str] = []
-        delay = 0.0
         with path.open(encoding="utf-8", errors="replace") as body:
             for line in itertools.islice(body, 1, None):
                 try:
-                    delay, text = loads(line.rstrip().removesuffix(","))
+                    _, text = loads(line.rstrip().removesuffix(","))
                     text = text.removeprefix(_CLEAR_AND_HOME)
                     frames.append(text.replace("\r\n", "\n"))
                 except (AttributeError, TypeError, RecursionError, ValueError):
                     break
-        if not frames or not isinstance(delay, float | int) or not 0 < delay < 1e6:
+        if not frames:
             raise ValueError("it contains no text frames")
-        return rate_from_timestep(delay), frames
+        return frames
 
 
 def _columns(line: str) -> int:

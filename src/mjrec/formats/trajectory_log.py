@@ -11,7 +11,7 @@ import contextlib
 import io
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -85,21 +85,24 @@ def _reader_of(
         # A recording without an end event extends to the next recording, if any.
         stop = count if recording.following is None else recording.following
     stop = max(first, min(stop, count))
-    heads = _sound_heads(rows, dtype, first, stop)
-    is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
+    rewards, flags = _sound_heads(rows, dtype, first, stop)
+    is_step, is_frame = flags & STEP != 0, flags & FRAME != 0
+    steps = _places(first, is_step)
     places = {
-        **dict.fromkeys(("state", "observation"), first + np.flatnonzero(is_step)),
+        **dict.fromkeys(("state", "observation"), steps),
         # The row of step k has the action that led to it. The reset's row has none.
-        "action": first + np.flatnonzero(is_step)[1:],
-        "snapshot": first + np.flatnonzero(is_frame),
+        "action": steps[1:],
+        "snapshot": _places(first, is_frame),
     }
+    numbers = np.cumsum(is_step)
+    numbers -= 1
     last = int(np.flatnonzero(is_step | is_frame).max(initial=-1))
     looks = _open_looks(recording, opened)
     changes = list(_find_changes(looks, recording.look, first + last + 1))
 
     def read(part: str, start: int, stop: int) -> NDArray[Any]:
         with unreadable(log):
-            return _read_part(rows, dtype, part, places[part][start:stop])
+            return _read_part(rows, dtype, part, np.array(places[part][start:stop]))
 
     def read_change(index: int) -> ModelChange:
         assert looks is not None
@@ -108,49 +111,55 @@ def _reader_of(
             fields = _unpack_fields(os.pread(looks.fileno(), length, offset))
             return ModelChange(step=step, fields=fields)
 
-    steps = heads[is_step][1:]
+    endings = flags[is_step][1:]
     promised = stop if recording.stop is None else max(stop, recording.stop)
     return TrajectoryReader(
         path=path,
         facts=dict(recording.facts),
         dtype=dtype,
         row_count=int(is_step.sum()),
-        rewards=steps["reward"].copy(),
-        terminated=steps["flags"] & TERMINATED != 0,
-        truncated=steps["flags"] & TRUNCATED != 0,
-        frame_steps=heads["step"][is_frame],
+        rewards=rewards[is_step][1:],
+        terminated=endings & TERMINATED != 0,
+        truncated=endings & TRUNCATED != 0,
+        frame_steps=numbers[is_frame],
         change_count=len(changes),
-        dropped=max(0, promised - first) - len(heads),
+        dropped=max(0, promised - first) - len(flags),
         read=read,
         read_change=read_change,
         release=opened.pop_all().close,
     )
 
 
+def _places(first: int, is_part: NDArray[np.bool_]) -> Sequence[int] | NDArray[np.intp]:
+    """Return the numbers of the rows with a part, in little memory if all have it."""
+    if is_part.all():
+        return range(first, first + len(is_part))
+    return first + np.flatnonzero(is_part)
+
+
 def _sound_heads(
     rows: RowLogReader, dtype: np.dtype[Any], first: int, stop: int
-) -> NDArray[Any]:
-    """Return the heads of the rows from `first` on, up to the first invalid row."""
-    names = ["row", "step", "reward", "flags"]
-    head = np.dtype([(name, dtype[name]) for name in names])
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return rewards and flags of the rows from `first` to the first invalid row."""
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
-    parts = [np.empty(0, head)]
+    rewards, flags = [np.empty(0)], [np.empty(0, np.uint8)]
+    steps = 0
     for start in range(first, stop, at_once):
         found = rows.read(start, min(stop, start + at_once)).view(dtype)[:, 0]
-        part = np.empty(len(found), head)
-        for name in names:
-            part[name] = found[name]
-        parts.append(part)
-        if (part["row"] != np.arange(start, start + len(part))).any():
+        numbers = steps + np.cumsum(found["flags"] & STEP != 0)
+        sound = found["row"] == np.arange(start, start + len(found))
+        sound &= found["flags"] & _KINDS != 0
+        # States, actions and frames are matched by their positions.
+        sound &= found["step"] == numbers - 1
+        if not sound.all():
             # A log may have a hole after its rows.
+            found = found[: np.argmin(sound)]
+        rewards.append(found["reward"].copy())
+        flags.append(found["flags"].astype(np.uint8))
+        if len(found) < len(sound):
             break
-    heads = np.concatenate(parts)
-    is_step = heads["flags"] & STEP != 0
-    sound = heads["row"] == np.arange(first, first + len(heads))
-    sound &= heads["flags"] & _KINDS != 0
-    # States, actions and frames are matched by their positions.
-    sound &= heads["step"] == np.cumsum(is_step) - 1
-    return heads if sound.all() else heads[: np.argmin(sound)]
+        steps = numbers[-1]
+    return np.concatenate(rewards), np.concatenate(flags)
 
 
 def _read_part(

@@ -4,9 +4,9 @@
 Images become an mp4 file with frame hashes, and text becomes an asciicast. The metadata
 file is written last: if it exists, the video is complete.
 
-A live mp4 file has a note, `.<name of the video>.note.part`, that lets any process
-finish it. The note is written before the video. While the video is being written, under
-a hidden name, it is locked both by the process that feeds ffmpeg and by ffmpeg itself,
+A live video has a note, `.<name of the video>.note.part`, that lets any process finish
+it. The note is written before the video. While an mp4 file is being written, under a
+hidden name, it is locked both by the process that feeds ffmpeg and by ffmpeg itself,
 which completes its file if that process dies.
 """
 
@@ -28,6 +28,8 @@ from .video_file import VideoFile
 from .video_metadata import file_facts, metadata_path, write_metadata
 from .video_writer import VideoWriter
 
+_TEXT_FACTS = {"encoder_version": {"backend": "TextEncoder", "version": 1}}
+
 _Note = Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]
 
 
@@ -39,7 +41,7 @@ class VideoSink:
         fps: frames per second.
         frame_hashes: whether to write the `.framehash` file of images.
         note: a function that returns the metadata and the timing known so far, for the
-            note about the unfinished mp4 file. Another process needs the note to finish
+            note about the unfinished file. Another process needs the note to finish
             the file if this process is killed. If None, no note is written; use this if
             the video can be rendered again.
 
@@ -84,17 +86,19 @@ class VideoSink:
         Raises:
             Error: see `VideoWriter.write`.
         """
+        if self._note is not None and not self._writer.frame_count:
+            # Write the note before the file that it describes.
+            metadata, timing = self._note()
+            facts: Mapping[str, Any] = _TEXT_FACTS
+            if isinstance(self._writer, VideoWriter) and not isinstance(frame, str):
+                facts = file_facts(self._writer.file_of(*frame.shape[:2]))
+            note = {"metadata": metadata, "facts": {**timing, **facts}}
+            write_text(note_path(self.path), dumps(note))
         if isinstance(self._writer, AsciicastWriter):
             assert isinstance(frame, str)
             self._writer.write(frame)
             return
         assert not isinstance(frame, str)
-        if self._note is not None and not self._writer.frame_count:
-            # Write the note before the file that it describes.
-            metadata, timing = self._note()
-            facts = {**timing, **file_facts(self._writer.file_of(*frame.shape[:2]))}
-            note = {"metadata": metadata, "facts": facts}
-            write_text(note_path(self.path), dumps(note))
         self._writer.write(frame if caption is None else annotated(frame, caption))
         self._is_annotated |= caption is not None
         # Check the frame without the caption, which would hide that it is blank.
@@ -150,7 +154,7 @@ class VideoSink:
 
     def _facts(self) -> dict[str, Any]:
         if self.file is None:
-            return {"encoder_version": {"backend": "TextEncoder", "version": 1}}
+            return dict(_TEXT_FACTS)
         facts = {**file_facts(self.file), **self.blank.facts()}
         if self._is_annotated:
             facts["annotated"] = {"pillow": check_annotation()}

@@ -94,8 +94,8 @@ class MonitoredRun:
     """The state shared by all recordings of a run, and the facts for their files.
 
     It writes the run's journal. With `on_error="raise"`, the caller raises an error for
-    each fault. With `on_error="warn"`, a fault is logged once and listed in the
-    manifest, and the simulation continues.
+    each fault, and the manifest lists those of a full disk. With `on_error="warn"`, a
+    fault is logged once and listed in the manifest, and the simulation continues.
 
     Args:
         directory: the monitor directory, in which the run claims an infix.
@@ -258,6 +258,8 @@ class MonitoredRun:
     ) -> bool:
         """Record a fault, and return whether the simulation may continue.
 
+        If it may not, only a full disk is recorded; the caller raises the error.
+
         Args:
             what: the part of the recording that failed, such as "video".
             error: the reason.
@@ -266,7 +268,13 @@ class MonitoredRun:
         has_episode = of_episode and self._episode is not None
         episode_id = self.episode.episode_id if has_episode else None
         is_warned = self.options.on_error == WARN
-        if is_warned and self.note_fault(what, str(error), episode_id=episode_id):
+        if not (is_warned or isinstance(error, FileNotWritten)):
+            return False
+        is_new = False
+        # The error to raise is the first one, not that the journal has no room either.
+        with contextlib.suppress(FileNotWritten):
+            is_new = self.note_fault(what, str(error), episode_id=episode_id)
+        if is_new and is_warned:
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Incomplete recording: %s%s. %s", what, of, error)
         return is_warned

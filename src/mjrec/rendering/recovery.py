@@ -14,12 +14,28 @@ from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .leftovers import RecoveredFile, has_leftovers, is_at_work, stale_shared_files
+from .recovery_needed import is_at_work, needs_recovery, stale_shared_files
 
 # Only one process at a time may recover a directory.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
 _MOMENT = 0.05
+
+
+@dataclass(frozen=True)
+class RecoveredFile:
+    """A file, and its state after a recovery.
+
+    Attributes:
+        name: the file's final base name.
+        what: a description of what was done with the file, or why it failed.
+    """
+
+    name: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.what}"
 
 
 @dataclass(frozen=True)
@@ -105,7 +121,7 @@ def recover(
         return Recovery(path, open_monitors=open_monitors)
     # Imported here because it loads HDF5, which a simulation that resumes after a
     # closed monitor does not need.
-    from .killed_monitor import Report, finish_killed_monitor
+    from .recover_monitor import Report, recover_monitor
 
     report = Report()
     if not os.access(path, os.W_OK | os.X_OK):
@@ -117,11 +133,15 @@ def recover(
         # Look again, because another process may have recovered them in the meantime.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
-            finish_killed_monitor(path, infix, report, bundles=bundle)
+            recover_monitor(path, infix, report, bundles=bundle)
         for stale in stale_shared_files(path):
             report.remove(stale)
         give_all_second_names(path)
-    return Recovery(path, (*report.files,), (*report.failures,), open_monitors)
+    files, failures = (
+        tuple(RecoveredFile(*each) for each in of)
+        for of in (report.files, report.failures)
+    )
+    return Recovery(path, files, failures, open_monitors)
 
 
 def _dead_and_open(directory: Path) -> tuple[list[str], tuple[str, ...]]:
@@ -132,7 +152,7 @@ def _dead_and_open(directory: Path) -> tuple[list[str], tuple[str, ...]]:
         try:
             if files.is_open:
                 still_open.append(files.infix)
-            elif has_leftovers(files):
+            elif needs_recovery(files):
                 dead.append(files.infix)
         except OSError as error:
             raise DirectoryNotWritable(directory, error.strerror) from error

@@ -6,7 +6,7 @@ changes, and only at the following times:
 
 - A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
 - A process has rendered pending videos (`rendering.finish`).
-- A process has recovered a dead monitor's files (`rendering.killed_monitor`).
+- A process has recovered a dead monitor's files (`rendering.recover_monitor`).
 - An evaluation has chosen its videos (`rendering.chosen_videos`).
 
 While a monitor is open, no other process writes its files.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that a monitor left unfinished when it ended.
+"""What a monitor that ended early has left for `recover` to finish or remove.
 
 Only names, locks and the journal are examined, because every `resume` does this in the
 simulation's process.
@@ -8,9 +8,7 @@ simulation's process.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
@@ -20,6 +18,7 @@ from ..formats.monitor_directory import (
     is_note,
     iter_monitor_files,
     unfinished_files,
+    view_of,
 )
 from ..formats.spans import recordings_in
 from ..formats.video_metadata import is_broken, metadata_path
@@ -29,42 +28,28 @@ from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
-# "video" is the note about a live video, "text" the frames of a text recording, and
-# "stale" an unfinished file that no process will finish, or a dead process's lock.
-# Leftovers are finished in this order, after the logs.
-Kind = Literal["video", "text", "stale"]
-
-
-@dataclass(frozen=True)
-class RecoveredFile:
-    """A file, and its state after a recovery.
-
-    Attributes:
-        name: the file's final base name.
-        what: a description of what was done with the file, or why it failed.
-    """
-
-    name: str
-    what: str
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.what}"
-
 
 def logs_left(files: MonitorFiles) -> list[Path]:
     """Return the row logs of a monitor that contain episodes or can be removed."""
     return [log for log in sorted(files.logs) if _has_work(log)]
 
 
-def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
-    """Return a monitor's leftover files of one kind."""
-    return [path for path in files.paths if _kind_of(path, files) == kind]
+def live_videos_left(files: MonitorFiles) -> list[Path]:
+    """Return the unfinished live videos of a monitor, an episode's first one last.
+
+    The first camera's metadata lists the other videos.
+    """
+    notes = [path for path in files.paths if is_note(path.name)]
+    videos = [path.with_name(final_name(path.name) or "") for path in notes]
+    # The data of a broken video is kept, in case it can be repaired.
+    left = [path for path in videos if not is_broken(metadata_path(path))]
+    return sorted(left, key=lambda path: not view_of(path.name))
 
 
-def has_leftovers(files: MonitorFiles) -> bool:
+def needs_recovery(files: MonitorFiles) -> bool:
     """Return whether a monitor has left any work to do."""
-    is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
-    return is_left or lacks_results(files)
+    found = logs_left(files) or live_videos_left(files) or stale_files(files)
+    return bool(found) or lacks_results(files)
 
 
 def is_at_work(directory: Path, infix: str) -> bool:
@@ -99,30 +84,32 @@ def _has_work(log: Path) -> bool:
     return not in_flight or any(each.path.suffix == ".h5" for each in in_flight)
 
 
-def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
-    """Return the kind of a leftover file; None if there is nothing to do with it."""
-    if path.suffix == ".lock" and path != files.lock:
-        return None if is_locked(path) else "stale"
+def stale_files(files: MonitorFiles) -> list[Path]:
+    """Return a monitor's files to remove: locks that no process holds, and parts.
+
+    These are parts of files that no process will finish.
+    """
+    return [path for path in files.paths if _is_stale(path, files)]
+
+
+def _is_stale(path: Path, files: MonitorFiles) -> bool:
+    if path.suffix == ".lock":
+        return path != files.lock and not is_locked(path)
     final = final_name(path.name)
-    if final is None:
-        return None
-    video = path.with_name(final)
-    if is_note(path.name):
-        # The data of a broken video is kept, in case it can be repaired.
-        return None if is_broken(metadata_path(video)) else "video"
+    if final is None or is_note(path.name):
+        return False
     name = VideoName.parse(final)
     if name is None:
-        return "stale"
+        return True
     mp4 = path.with_name(name.video)
-    if note_path(mp4).exists() and final.endswith((".mp4", ".framehash")):
-        return None
+    notes = map(note_path, (mp4, mp4.with_suffix(".json")))
+    if name.ending in ("mp4", "json", "framehash") and any(map(Path.exists, notes)):
+        return False
     # A clip's video may have the name of an episode's video.
     clips = f".openaigym.clip.{files.infix}."
     locks = [p for p in files.paths if p.name.startswith(clips)]
     locks.append(mp4.with_name(f".{mp4.stem}.lock"))
-    if any(map(is_locked, [*unfinished_files(mp4), *locks])):
-        return None
-    return "text" if name.is_episodes and name.ending == "json" else "stale"
+    return not any(map(is_locked, [*unfinished_files(mp4), *locks]))
 
 
 def lacks_results(files: MonitorFiles) -> bool:

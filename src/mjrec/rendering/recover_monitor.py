@@ -34,10 +34,15 @@ from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .jobs import key_of
-from .killed_videos import finish_text, finish_video
-from .leftovers import Kind, RecoveredFile, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
+from .recover_live_videos import finish_video
+from .recovery_needed import (
+    lacks_results,
+    live_videos_left,
+    logs_left,
+    stale_files,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -49,16 +54,16 @@ class Report:
     """A report of finished files and failures.
 
     Attributes:
-        files: files that were finished.
-        failures: files that could not be finished.
+        files: names of files that were finished, and what was done with each.
+        failures: names of files that could not be finished, and the reasons.
     """
 
-    files: list[RecoveredFile] = field(default_factory=list)
-    failures: list[RecoveredFile] = field(default_factory=list)
+    files: list[tuple[str, str]] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
 
     def note(self, name: str, what: str) -> None:
         """Note what was done with a file."""
-        self.files.append(RecoveredFile(name, what))
+        self.files.append((name, what))
 
     @contextlib.contextmanager
     def attempt(self, name: str) -> Iterator[None]:
@@ -66,11 +71,10 @@ class Report:
         try:
             yield
         except (Error, OSError) as error:
-            self.failures.append(RecoveredFile(name, str(error)))
+            self.failures.append((name, str(error)))
         except Exception as error:
             logger.exception("%s could not be recovered.", name)
-            why = f"{type(error).__name__}: {error}"
-            self.failures.append(RecoveredFile(name, why))
+            self.failures.append((name, f"{type(error).__name__}: {error}"))
 
     def remove(self, stale: Path) -> None:
         """Remove an unfinished file, or a lock file that no process holds."""
@@ -83,7 +87,7 @@ class Report:
                 self.note(stale.name, "left behind, removed")
 
 
-def finish_killed_monitor(
+def recover_monitor(
     directory: Path, infix: str, report: Report, *, bundles: bool
 ) -> None:
     """Finish all files of one monitor except pending videos, unless it is still open.
@@ -106,7 +110,7 @@ def finish_killed_monitor(
         if lock is None:
             return
         if was_killed:
-            report.note(path.name, "its monitor was killed")
+            report.note(path.name, "its monitor did not close")
         try:
             monitor.finish(is_behind=is_behind)
         except BaseException:
@@ -121,16 +125,12 @@ def finish_killed_monitor(
 
 @dataclass(kw_only=True)
 class _KilledMonitor:
-    """A monitor that is not open; see `finish_killed_monitor`."""
+    """A monitor that is not open; see `recover_monitor`."""
 
     directory: Path
     infix: str
     report: Report
     bundles: bool
-
-    def _left(self, kind: Kind) -> list[Path]:
-        """Return the current leftover files of one kind."""
-        return leftovers(self._files(), kind)
 
     def finish(self, *, is_behind: bool) -> None:
         """Finish the monitor's files. The caller holds the monitor's lock.
@@ -144,19 +144,12 @@ class _KilledMonitor:
                 self._finish_log(log)
         # Turning logs into trajectories does not change the manifest.
         before = len(report.files)
-        # First cameras come last, because their metadata lists the other videos.
-        for note in sorted(self._left("video"), key=_is_first):
-            path = note.with_name(final_name(note.name) or "")
-            with report.attempt(path.name):
-                known = self._known(episode_of(path.name))
-                self._note_all(finish_video(path, known))
-        for text in self._left("text"):
-            path = text.with_name(final_name(text.name) or "")
-            number = episode_of(path.name)
-            with report.attempt(path.name):
-                facts, known = self._facts(number), self._known(number)
-                self._note_all(finish_text(text, path, facts, known))
-        for stale in self._left("stale"):
+        for video in live_videos_left(self._files()):
+            with report.attempt(video.name):
+                known = self._known(episode_of(video.name))
+                for name, what in finish_video(video, known):
+                    report.note(name, what)
+        for stale in stale_files(self._files()):
             with self._claimed(stale) as is_ours:
                 if is_ours:
                     report.remove(stale)
@@ -168,10 +161,6 @@ class _KilledMonitor:
 
     def _files(self) -> MonitorFiles:
         return files_of(self.directory, self.infix)
-
-    def _note_all(self, done: Iterable[tuple[str, str]]) -> None:
-        for name, what in done:
-            self.report.note(name, what)
 
     def _finish_log(self, log: Path) -> None:
         """Turn the episodes in a log into trajectories; remove the log if it is idle.
@@ -353,11 +342,6 @@ def _how_long(path: Path) -> str:
         steps = counted(reader.step_count, "step")
         is_cut = reader.facts.get("reason") == killed_episodes.KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
-
-
-def _is_first(note: Path) -> bool:
-    name = VideoName.parse(final_name(note.name) or "")
-    return name is not None and not name.view
 
 
 def _numbers(files: MonitorFiles) -> set[int]:

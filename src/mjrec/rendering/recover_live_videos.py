@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos that were being recorded live when their process was killed.
 
-The encoder encodes all frames that it received, and finishes its hidden file. A note
-next to that file describes the video.
-
-Text recordings are written to disk frame by frame and have no note. The rate is derived
-from their frames, and the other facts from the episode's trajectory, if it exists.
+The encoder encodes all frames that it received, and finishes its hidden file. Text is
+written to a hidden file frame by frame. A note next to the file describes the video.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from ..errors import DirectoryNotWritable, EncoderError, Error, UnreadableFile
-from ..formats.asciicast import unfinished_recording
+from ..formats.asciicast import AsciicastWriter, unfinished_frames
 from ..formats.ffmpeg import ffmpeg_sha256, ffmpeg_version
 from ..formats.frame_hashes import cut_frame_hashes, frame_hash_path
 from ..formats.json_fields import (
@@ -30,17 +28,15 @@ from ..formats.json_fields import (
 )
 from ..formats.killed_episodes import CUT_BY_KILL
 from ..formats.locks import is_locked
-from ..formats.monitor_directory import episode_of, unfinished_files
+from ..formats.monitor_directory import unfinished_files
 from ..formats.video_file import content_facts
 from ..formats.video_metadata import (
     StepRuns,
     further_live_videos,
     metadata_path,
-    recording_facts,
-    timing_facts,
     write_metadata,
 )
-from ..formats.video_sink import VideoSink, note_path
+from ..formats.video_sink import note_path
 from ..plain_text import counted
 
 # Only the metadata of clips has this key.
@@ -70,12 +66,13 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
         Error: the encoder is still running, or the files cannot be written.
     """
     try:
-        about, facts = _read_note(note_path(path))
+        about, facts = _read_note(path)
     except UnreadableFile:
         # A note is written before its video exists.
         note_path(path).unlink(missing_ok=True)
         return
-    part = next(iter(unfinished_files(path)), path)
+    # A process that was killed here has left the beginning of a second text file.
+    part = max(unfinished_files(path), key=lambda p: p.stat().st_size, default=path)
     if is_locked(part):
         raise Error(
             f"The encoder for {path.name} is still finishing its file. To wait longer: "
@@ -86,17 +83,19 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
             # A clip spans episodes. Facts about one do not describe its end.
             known = {}
         try:
-            found = _finish_files(part, path, facts)
+            finish = _finish_text if path.suffix == ".json" else _finish_images
+            found = finish(part, path, facts)
             metadata = _metadata(path, about, {**facts, **found}, known)
             done = path.name, _counted(metadata["frame_count"], metadata)
-        except EncoderError as error:
+        except (EncoderError, UnreadableFile) as error:
             ending = known if "complete" in known else {**known, **CUT_BY_KILL}
             metadata = {**about, **ending, "empty": True, "recovered": True}
             done = metadata_path(path).name, "there were no frames yet"
             # Frames are hashed before they are encoded, so the encoder may not have
             # received the last one.
             if _hashed_frames(path) > 1:
-                why = (error.stderr.strip().splitlines() or [str(error)])[-1]
+                words = getattr(error, "stderr", "").strip().splitlines()
+                why = [str(error), *words][-1]
                 metadata |= {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
                 write_metadata(path, metadata)
                 yield path.name, f"broken ({why}); its data is in {part.name}"
@@ -108,20 +107,24 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
         left.unlink(missing_ok=True)
 
 
-def _read_note(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def _read_note(video: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Return the metadata about a recording, and the facts about its file and timing.
 
     Raises:
         UnreadableFile: the note is missing or damaged.
     """
+    path = note_path(video)
     with unreadable(path):
         values = read_object(path)
         facts = field(values, "facts", mapping)
-        for key in ("padded_height", "padded_width", "stride", "frames_per_step"):
+        for key in ("stride", "frames_per_step"):
             field(facts, key, positive)
         field(facts, "fps", rate)
         field(facts, "timestep", optional(rate))
-        field(facts, "pixel_format", text)
+        if video.suffix == ".mp4":
+            for key in ("padded_height", "padded_width"):
+                field(facts, key, positive)
+            field(facts, "pixel_format", text)
         field(facts, "encoder_version", mapping)
         return field(values, "metadata", mapping), facts
 
@@ -136,7 +139,7 @@ def _hashed_frames(video: Path) -> int:
     return sum(not line.startswith("#") for t in texts for line in t.splitlines())
 
 
-def _finish_files(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _finish_images(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Rename a video and its frame hashes, and return facts about their content.
 
     Raises:
@@ -166,6 +169,21 @@ def _finish_files(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str
     return {**found, "ffmpeg_sha256": ffmpeg_sha256() if is_same_ffmpeg else None}
 
 
+def _finish_text(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a text recording anew, and return facts about its content.
+
+    Raises:
+        UnreadableFile: there is no complete frame.
+        FileNotWritten: the disk is full.
+    """
+    frames = unfinished_frames(part)
+    writer = AsciicastWriter(video, rate=Fraction(facts["fps"]))
+    for frame in frames:
+        writer.write(frame)
+    writer.close()
+    return {"frame_count": len(frames)}
+
+
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
     ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
     return f"{counted(count, 'frame')}{ending}"
@@ -186,7 +204,8 @@ def _metadata(
     if not is_whole or "complete" not in known:
         # The encoder had not received the last frames.
         steps = [*range(0, frame_count * stride, stride)]
-        known = {**_sums(known), **CUT_BY_KILL}
+        sums = {key: known[key] for key in ("length", "reward") if key in known}
+        known = {**sums, **CUT_BY_KILL}
     # The step of each frame is known only if there is one frame per step.
     is_known = frames_per_step == 1
     further = further_live_videos(video)
@@ -198,50 +217,3 @@ def _metadata(
         **({"further_videos": further} if further else {}),
         "recovered": True,
     }
-
-
-def _sums(known: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: known[key] for key in ("length", "reward") if key in known}
-
-
-def finish_text(
-    part: Path, path: Path, facts: Mapping[str, Any], known: Mapping[str, Any]
-) -> Iterator[tuple[str, str]]:
-    """Write a text recording and its metadata from the frames on disk.
-
-    Args:
-        part: the hidden file that the frames were written to.
-        path: the recording to write.
-        facts: the facts in the episode's trajectory; empty without a trajectory.
-        known: see `finish_video`.
-
-    Yields:
-        The name of the file and what was done with it. Nothing if the recording exists.
-
-    Raises:
-        Error: the files cannot be written.
-    """
-    if not metadata_path(path).exists():
-        try:
-            rate, frames = unfinished_recording(part)
-        except UnreadableFile:
-            # The file does not contain a complete frame.
-            part.unlink(missing_ok=True)
-            yield part.name, "unfinished, removed"
-            return
-        if "complete" not in known or known.get("length") != len(frames) - 1:
-            known = {**_sums(known), **CUT_BY_KILL}
-        sink = VideoSink(path, fps=rate)
-        for frame in frames:
-            sink.write(frame)
-        sink.finish()
-        description = {
-            "episode_id": episode_of(path.name),
-            "content_type": "video/vnd.openai.ansivid",
-            **recording_facts(facts, recording="live"),
-            **known,
-            **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
-            "recovered": True,
-        }
-        yield path.name, _counted(len(frames), sink.describe(description))
-    part.unlink(missing_ok=True)
