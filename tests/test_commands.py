@@ -167,6 +167,31 @@ def test_a_return_that_is_nan_is_no_success(
     assert "best" not in out
 
 
+def test_every_command_shows_returns_that_are_nan(mjrec, tmp_path, monkeypatch):
+    """Those that judge nothing show them, too, and do what they were asked for."""
+    monkeypatch.chdir(tmp_path)
+    Path("nan_env.py").write_text(NAN)
+    run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, "--allow-nan")
+    small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
+    mjrec("evaluate", *run, *small, "--out", "e")
+    mjrec("record", *run, "--out", "r", "--schedule", "none")
+    for directory, first in (
+        ("e", "nan_env:Nan-v0 seed 0 episode 0"),
+        ("r", "r episode 0"),
+    ):
+        for command in (
+            ("list", directory),
+            ("render", directory),
+            ("report", directory, "--out", f"{directory}-page"),
+            ("pack", directory, "--out", f"{directory}.zip"),
+        ):
+            status, out, err = mjrec(*command)
+            assert status == 0
+            assert f"NaN or infinite: 2 returns: {first} and 1 more" in out + err
+        for command in ("render", directory), ("report", directory, "--out", "page"):
+            assert json.loads(mjrec(*command, "--json")[1])["not_finite"] == 2
+
+
 def test_wrong_usage_is_status_2(mjrec):
     """As every command line has it."""
     with pytest.raises(SystemExit) as left:

@@ -20,6 +20,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
+from .not_finite import not_finite_in, not_finite_lines
 from .options import AsJson
 from .terminal import print_json, print_rows, printable
 
@@ -56,6 +57,7 @@ def list_episodes(
         else:
             names = ("task", "seed", "episode", "steps", "return", "ended", "video")
             _print_table(directory, names, map(_row_of_result, results))
+            _print_not_finite(directory)
         return 0
     for place in recording_directories(directory):
         more = {} if place == directory else {"directory": place.name}
@@ -65,6 +67,8 @@ def list_episodes(
         if more:
             sys.stdout.write(f"{place}:\n")
         _print_monitors(place)
+    if not as_json:
+        _print_not_finite(directory)
     return 0
 
 
@@ -76,6 +80,11 @@ def _print_all(objects: Iterable[dict[str, Any]]) -> None:
 def _print_table(directory: Path, names: Sequence[str], rows: _Rows) -> None:
     if not print_rows(names, rows, left=_TEXTS):
         sys.stdout.write(f"No episodes are recorded in {directory}.\n")
+
+
+def _print_not_finite(directory: Path) -> None:
+    for line in not_finite_lines(not_finite_in(directory)):
+        sys.stdout.write(f"{line}\n")
 
 
 # --- An evaluation ----------------------------------------------------------------
