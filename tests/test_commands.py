@@ -235,7 +235,10 @@ def test_list_says_which_videos_are_pending_and_which_episode_is_best(mjrec, tmp
     clip.with_suffix(".meta.json").touch()
     _, out, _ = mjrec("list", tmp_path)
     assert out.count("pending") == 1
-    assert out.splitlines()[-2:] == ["Other videos:", f"  {clip.name}"]
+    assert out.splitlines()[-3:] == [
+        *("Other videos:", f"  {clip.name}"),
+        f"NaN or infinite: 1 return: {tmp_path.name} episode 0",
+    ]
     assert "monitor" not in out
     _, out, _ = mjrec("list", tmp_path, "--json")
     first, second = (json.loads(line) for line in out.splitlines())
