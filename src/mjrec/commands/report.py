@@ -12,9 +12,8 @@ import tyro
 
 from ..monitors.progress import progress_bar
 from ..reporting.report_folder import write_report
-from .not_finite import not_finite_in, not_finite_lines
 from .options import AsJson
-from .terminal import print_json, print_lines
+from .terminal import print_json
 
 
 def report(
@@ -69,11 +68,8 @@ def report(
                 f"{progress.done}/{progress.total}",
             ),
         )
-    not_finite = [name for each in directories for name in not_finite_in(each)]
     if as_json:
-        print_json({"page": str(page.absolute()), "not_finite": len(not_finite)})
+        print_json({"page": str(page.absolute())})
     else:
-        # Standard output is the page's path alone.
-        print_lines(console, not_finite_lines(not_finite))
         sys.stdout.write(f"{page.absolute()}\n")
     return 0
