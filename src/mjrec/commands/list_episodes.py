@@ -21,7 +21,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
-from .not_finite import episode_name, not_finite_lines
+from .not_finite import not_finite_lines
 from .options import AsJson
 from .terminal import print_json, print_rows, printable
 
@@ -104,7 +104,7 @@ def _row_of_result(
     result: EpisodeResult, path: Path | None, not_finite: list[str]
 ) -> Sequence[str]:
     if not math.isfinite(result.total_reward or 0):
-        not_finite.append(episode_name(result))
+        not_finite.append(result.name)
     fields = _fields_of_result(result, path)
     video = Path(fields["video"]).name if fields["video"] else ""
     return (

@@ -5,12 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import Error
-from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.evaluation import is_evaluation, results_in
 from ..formats.monitor_directory import recording_directories
 from ..plain_text import counted, listed
 from ..results import iter_episodes
@@ -18,11 +16,6 @@ from .terminal import printable
 
 # Follows the number of returns where the option exists.
 ALLOWED = " (--allow-nan accepts them)"
-
-
-def episode_name(each: EpisodeResult) -> str:
-    """Return the name of an evaluation's episode."""
-    return f"{each.task} seed {each.seed} episode {each.episode}"
 
 
 def not_finite_lines(names: Sequence[str], more: str = "") -> list[str]:
@@ -40,15 +33,10 @@ def not_finite_in(directory: Path) -> list[str]:
     """Return the names of a directory's episodes whose return is NaN or infinite."""
     # A command has already shown the files that cannot be read.
     with contextlib.suppress(Error):
-        return [name for name, value in _returns(directory) if not math.isfinite(value)]
+        return [
+            f"{place.name} episode {each.episode_id}"
+            for place in recording_directories(directory)
+            for each in iter_episodes(place)
+            if not math.isfinite(each.reward)
+        ]
     return []
-
-
-def _returns(directory: Path) -> Iterator[tuple[str, float]]:
-    if is_evaluation(directory):
-        for result, _ in results_in(directory):
-            yield episode_name(result), result.total_reward or 0.0
-        return
-    for place in recording_directories(directory):
-        for each in iter_episodes(place):
-            yield f"{place.name} episode {each.episode_id}", each.reward
