@@ -88,7 +88,8 @@ def engine_from(
         raise UnknownName("engine", name, ENGINES)
     if address is not None and name != "ray":
         raise InvalidArgument(
-            f"The address {address} is for a Ray cluster, but the engine is {name}."
+            f"The address {address} is for a Ray cluster (--engine ray), but the "
+            f"engine is {name}."
         )
     if options and name != "slurm":
         raise InvalidArgument(
