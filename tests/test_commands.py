@@ -143,6 +143,27 @@ def test_nan_fails_unless_allowed(command, tmp_path, monkeypatch, allowed, statu
     assert "best" not in out
 
 
+def test_every_command_shows_returns_that_are_nan(command, tmp_path, monkeypatch):
+    """Commands that judge no run succeed."""
+    monkeypatch.chdir(tmp_path)
+    Path("nan_env.py").write_text(NAN)
+    run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, "--allow-nan")
+    small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
+    command("evaluate", *run, *small, "--out", "e")
+    command("record", *run, "--out", "r", "--schedule", "none")
+    for directory in ("e", "r"):
+        for name, *options in (
+            ("list",),
+            ("render",),
+            ("pack", "--out", f"{directory}.zip"),
+        ):
+            shown = command(name, directory, *options).out
+            assert "NaN or infinite: 2 returns: " in shown
+        rendered = json.loads(command("render", directory, "--json").out)
+        assert rendered["not_finite"] == 2
+        assert "NaN or infinite: 2 returns of" in command("report", directory).err
+
+
 # Takes more than five seconds: each of three videos starts renderers.
 def test_cameras_make_one_video_each_or_one_tiled_video(command, tmp_path):
     """A model file plays at 60 frames per second."""
@@ -174,7 +195,10 @@ def test_list_shows_pending_videos_clips_and_the_best_episode(command, tmp_path)
     clip.with_suffix(".meta.json").touch()
     out = command("list", tmp_path).out
     assert out.count("pending") == 1
-    assert out.splitlines()[-2:] == ["Other videos:", f"  {clip.name}"]
+    assert out.splitlines()[-3:] == [
+        *("Other videos:", f"  {clip.name}"),
+        f"NaN or infinite: 1 return: {tmp_path.name} episode 0",
+    ]
     assert "monitor" not in out
     first, second = json_lines(command("list", tmp_path, "--json").out)
     assert (first["pending"], first["trajectory"]) == (False, None)

@@ -21,9 +21,8 @@ from engine_runs import (
 from interruption import ctrl_c_soon
 from waiting import wait_until
 
-from mjrec.engines.gpu_shares import GpuShare
 from mjrec.engines.jobs import Run
-from mjrec.engines.local import LocalEngine
+from mjrec.engines.local import GpuShare, LocalEngine
 from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
 from mjrec.machine import usable_cpus
 

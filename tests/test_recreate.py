@@ -52,6 +52,13 @@ def test_an_environment_is_made_with_its_arguments_limit_and_view():
     assert env.unwrapped.spec.kwargs == kwargs
 
 
+@pytest.mark.parametrize("limit", [None, 7, 5000])
+def test_the_recorded_limit_replaces_the_registered_one(limit):
+    """Whether it is none, lower or higher."""
+    made = recreate(facts("HalfCheetah-v5", max_episode_steps=limit)).environment
+    assert made.spec.max_episode_steps == limit
+
+
 @pytest.mark.parametrize(
     "env_id",
     ["subprocess:check_output", "os:system", f"../{PENDULUM}", "Nobody-v0", ""],

@@ -42,6 +42,7 @@ Every message says what was requested, what was found, and what to do.
 from __future__ import annotations
 
 import difflib
+import importlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -430,6 +431,29 @@ class MissingDependency(Error, ImportError):
         self.package = package
         what = "which is not installed" if reason is None else f"but {reason}"
         super().__init__(f"{purpose} needs {package}, {what}. Run: {install}")
+
+
+def optional_module(name: str, *, purpose: str, install: str) -> Any:
+    """Import a module of a package that is optional.
+
+    Args:
+        name: the module's name.
+        purpose: see `MissingDependency`.
+        install: what pip installs.
+
+    Raises:
+        MissingDependency: the package is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        # The package may be there, and lack one that it needs itself.
+        if not f"{name}.".startswith(f"{error.name}."):
+            raise
+        package = name.partition(".")[0]
+        raise MissingDependency(
+            package, purpose=purpose, install=f'pip install "{install}"'
+        ) from error
 
 
 KINDS: Mapping[str, type[Error]] = {

@@ -17,7 +17,6 @@ import rich.table
 import tyro
 
 from ..errors import InvalidArgument, UnknownName
-from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.evaluating import NOT_GIVEN
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
@@ -30,6 +29,7 @@ from ..formats.json_fields import to_json
 from ..monitors.progress import ShowProgress, progress_bar
 from ..plain_text import counted, listed
 from ..recorder.keep_rules import keep_rule
+from .not_finite import ALLOWED, not_finite_lines
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
     FAILED,
@@ -371,31 +371,24 @@ def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
     if failed := evaluation.failed:
         total = counted(len(evaluation.results), "episode")
         yield f"{len(failed)} of {total} failed:"
-        reasons = names_by({_name(each): str(each.failure) for each in failed})
+        reasons = names_by({each.name: str(each.failure) for each in failed})
         for reason, names in [*reasons.items()][:_SHOWN]:
             yield f"  {printable(listed(names, 1))}: {printable(reason)}"
         if len(reasons) > _SHOWN:
             yield f"  and {len(reasons) - _SHOWN} more reasons, in results.csv"
-    if not_finite := evaluation.not_finite:
-        yield (
-            f"NaN or infinite: {counted(len(not_finite), 'return')} (--allow-nan "
-            f"accepts them): {listed([*map(_name, not_finite)], 1)}"
-        )
+    not_finite = [each.name for each in evaluation.not_finite]
+    yield from not_finite_lines(not_finite, ALLOWED)
 
 
 def _example_lines(evaluation: Evaluation) -> Iterator[str]:
     """Yield a line for the best, median and worst episode of each task."""
-    not_finite = set(map(_name, evaluation.not_finite))
+    not_finite = {each.name for each in evaluation.not_finite}
     for task in evaluation.plan.tasks[:_SHOWN]:
         known = sorted(evaluation.by_task[task.name], key=lambda each: each.unit)
-        known = [each for each in known if _name(each) not in not_finite]
+        known = [each for each in known if each.name not in not_finite]
         for each, role in keep_rule("best,median,worst").choose(known):
             value, file = _number(each.total_reward), evaluation.file_of(each)
-            yield f"  {role:6}  {value:>10}  {_name(each)}  {file}"
-
-
-def _name(each: EpisodeResult) -> str:
-    return f"{each.task} seed {each.seed} episode {each.episode}"
+            yield f"  {role:6}  {value:>10}  {each.name}  {file}"
 
 
 def _fields(evaluation: Evaluation, short: Mapping[str, str]) -> dict[str, Any]:

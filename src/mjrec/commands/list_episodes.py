@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,6 +21,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
+from .not_finite import not_finite_lines
 from .options import AsJson
 from .terminal import print_json, print_rows, printable
 
@@ -49,13 +51,16 @@ def list_episodes(
         as_json: print one JSON object per episode, one per line, instead of a table.
             Each has a `directory` key if there are several directories.
     """
+    not_finite: list[str] = []
     if is_evaluation(directory):
-        results = (_fields_of_result(*each) for each in results_in(directory))
+        results = results_in(directory)
         if as_json:
-            _print_all(results)
+            _print_all(itertools.starmap(_fields_of_result, results))
         else:
             names = ("task", "seed", "episode", "steps", "return", "ended", "video")
-            _print_table(directory, names, map(_row_of_result, results))
+            rows = (_row_of_result(*each, not_finite) for each in results)
+            _print_table(directory, names, rows)
+            _print_not_finite(not_finite)
         return 0
     for place in recording_directories(directory):
         more = {} if place == directory else {"directory": place.name}
@@ -64,7 +69,8 @@ def list_episodes(
             continue
         if more:
             sys.stdout.write(f"{place}:\n")
-        _print_monitors(place)
+        _print_monitors(place, not_finite)
+    _print_not_finite(not_finite)
     return 0
 
 
@@ -78,6 +84,11 @@ def _print_table(directory: Path, names: Sequence[str], rows: _Rows) -> None:
         sys.stdout.write(f"No episodes are recorded in {directory}.\n")
 
 
+def _print_not_finite(names: Sequence[str]) -> None:
+    for line in not_finite_lines(names):
+        sys.stdout.write(f"{line}\n")
+
+
 # --- An evaluation ----------------------------------------------------------------
 
 
@@ -89,7 +100,12 @@ def _fields_of_result(result: EpisodeResult, video: Path | None) -> dict[str, An
     }
 
 
-def _row_of_result(fields: dict[str, Any]) -> Sequence[str]:
+def _row_of_result(
+    result: EpisodeResult, path: Path | None, not_finite: list[str]
+) -> Sequence[str]:
+    if not math.isfinite(result.total_reward or 0):
+        not_finite.append(result.name)
+    fields = _fields_of_result(result, path)
     video = Path(fields["video"]).name if fields["video"] else ""
     return (
         *(str(fields[name]) for name in ("task", "seed", "episode", "length")),
@@ -112,7 +128,7 @@ def _end(terminated: bool | None) -> str:
 # --- A monitor directory ----------------------------------------------------------
 
 
-def _print_monitors(directory: Path) -> None:
+def _print_monitors(directory: Path, not_finite: list[str]) -> None:
     # The names of the videos that show exactly one completed episode.
     known: set[str] = set()
     best: list[Episode] = []
@@ -122,8 +138,9 @@ def _print_monitors(directory: Path) -> None:
 
     def rows() -> _Rows:
         for episode in iter_episodes(directory):
-            is_best = not best or episode.reward > best[0].reward
-            if is_best and math.isfinite(episode.reward):
+            if not math.isfinite(episode.reward):
+                not_finite.append(f"{directory.name} episode {episode.episode_id}")
+            elif not best or episode.reward > best[0].reward:
                 best[:] = [episode]
             further = _further_videos(episode)
             video = "pending" if episode.pending else ""

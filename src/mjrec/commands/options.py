@@ -39,11 +39,6 @@ def size_of(text: str | None) -> tuple[int | None, int | None]:
     return check_size(int(match[2]), int(match[1]))
 
 
-def number_or_name(text: str) -> str | int:
-    """Return `text` as an int if it is a whole number, otherwise unchanged."""
-    return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
-
-
 def camera_of(text: str | None) -> PlainCamera | None:
     """Return a camera: a number, a name, or fields of an `MjvCamera` from JSON.
 
@@ -55,7 +50,7 @@ def camera_of(text: str | None) -> PlainCamera | None:
         return None
     if text.lstrip().startswith("{"):
         return plain_camera(kwargs_of(text, "--camera"))
-    return number_or_name(text)
+    return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
 
 
 def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
@@ -115,17 +110,7 @@ class EngineOptions:
             UnknownName: the engine has no option with that name.
             MissingDependency: a package that the engine needs is not installed.
         """
-        options = _options_of(self.engine_option)
-        if self.engine is None and self.address is not None:
-            raise InvalidArgument(
-                f"--address {self.address} needs a Ray cluster: add --engine ray."
-            )
-        if self.engine is None and options:
-            raise InvalidArgument(
-                f"--engine-option {next(iter(options))} needs an engine, such as "
-                "--engine slurm."
-            )
-        if self.engine is None and self.gpus is None and not self.require_gpu:
+        if self == NO_ENGINE:
             return None
         return engine_from(
             self.engine or _LOCAL,
@@ -133,7 +118,7 @@ class EngineOptions:
             address=self.address,
             gpus=self.gpus or 0.0,
             require_gpu=self.require_gpu,
-            options=options,
+            options=_options_of(self.engine_option),
         )
 
 

@@ -17,6 +17,7 @@ from ..errors import InvalidArgument
 from ..evidence.pack import pack as pack_directory
 from ..evidence.size_limit import shown_size
 from ..monitors.progress import render_progress
+from .not_finite import not_finite_in, not_finite_lines
 from .terminal import print_lines
 
 _NUMBERS = re.compile(r"\d{1,15}(,\d{1,15})*", re.ASCII)
@@ -65,7 +66,8 @@ def pack(
             max_size=max_size,
             on_progress=on_progress,
         )
-    print_lines(rich.console.Console(), _lines(archive))
+    lines = [*_lines(archive), *not_finite_lines(not_finite_in(directory))]
+    print_lines(rich.console.Console(), lines)
     return 0
 
 

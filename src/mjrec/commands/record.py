@@ -19,6 +19,7 @@ from ..monitors.progress import progress_bar
 from ..plain_text import counted
 from ..recorder.options import RecorderOptions
 from ..sessions import Session, SessionEpisode, record_session, with_chosen_videos
+from .not_finite import ALLOWED, not_finite_lines
 from .options import AsJson, camera_of, kwargs_of, size_of
 from .terminal import FAILED, INTERRUPTED, print_json, print_lines
 
@@ -137,15 +138,14 @@ def record(
     recorded, interrupted = _run(session, console)
     if keep is not None:
         recorded = with_chosen_videos(recorded)
-    not_finite = [e.episode_id for e in recorded if not math.isfinite(e.reward)]
+    not_finite = [
+        f"episode {e.episode_id}" for e in recorded if not math.isfinite(e.reward)
+    ]
     if as_json:
         print_json(_fields(session, recorded, interrupted))
     else:
         print_lines(console, _summary(session, recorded, interrupted))
-        if not_finite:
-            what = counted(len(not_finite), "return")
-            where = f"(--allow-nan accepts them), first in episode {not_finite[0]}"
-            print_lines(console, [f"NaN or infinite: {what} {where}"])
+        print_lines(console, not_finite_lines(not_finite, ALLOWED))
     if interrupted:
         return INTERRUPTED
     return FAILED if not_finite and not allow_nan else 0

@@ -20,6 +20,7 @@ from ..monitors.progress import render_progress
 from ..plain_text import counted
 from ..rendering.jobs import RenderedVideos, Variant, View
 from ..rendering.render_videos import iter_rendered_videos
+from .not_finite import not_finite_in, not_finite_lines
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
 from .terminal import FAILED, INTERRUPTED, names_by, print_json, print_lines
 
@@ -134,10 +135,13 @@ def render(
             "change (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
             "where to write it (--out)."
         )
+    not_finite = not_finite_in(directory)
     if as_json:
-        print_json(_fields(report, is_interrupted))
+        of_returns = {"not_finite": len(not_finite)}
+        print_json({**_fields(report, is_interrupted), **of_returns})
     else:
         print_lines(console, _summary(report, is_interrupted))
+        print_lines(console, not_finite_lines(not_finite))
     if is_interrupted:
         return INTERRUPTED
     return FAILED if report.failures or report.blank else 0

@@ -7,8 +7,7 @@ import weakref
 from collections.abc import Mapping
 from concurrent.futures import Executor
 
-from ..errors import Error, InvalidArgument, UnknownName
-from .gpu_shares import engine_package
+from ..errors import Error, InvalidArgument, UnknownName, optional_module
 from .local import LocalEngine
 from .ray import RayEngine
 from .slurm import SlurmEngine, slurm_options
@@ -89,7 +88,8 @@ def engine_from(
         raise UnknownName("engine", name, ENGINES)
     if address is not None and name != "ray":
         raise InvalidArgument(
-            f"The address {address} is for a Ray cluster, but the engine is {name}."
+            f"The address {address} is for a Ray cluster (--engine ray), but the "
+            f"engine is {name}."
         )
     if options and name != "slurm":
         raise InvalidArgument(
@@ -104,8 +104,10 @@ def engine_from(
 
 
 def _dask(address: str) -> Executor:
-    distributed = engine_package(
-        "distributed", f"{_DASK}{address}", install="dask[distributed]"
+    distributed = optional_module(
+        "distributed",
+        purpose=f'engine="{_DASK}{address}"',
+        install="dask[distributed]",
     )
     try:
         client = distributed.Client(

@@ -25,9 +25,9 @@ from typing import Any
 import mjrec
 
 from ..child_python import changed_environ
-from ..errors import ClosedError, Error, GLError, InvalidArgument
+from ..errors import ClosedError, Error, GLError, InvalidArgument, optional_module
 from ..machine import usable_cpus
-from .gpu_shares import GpuShare, check_worker_count, engine_package
+from .local import GpuShare, check_worker_count
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class RayEngine(Executor):
         self.workers = check_worker_count(workers)
         self.address = address
         self.share = GpuShare(each=gpus, required=require_gpu)
-        self._ray = engine_package("ray", "ray", install="mjrec[ray]")
+        self._ray = optional_module("ray", purpose='engine="ray"', install="mjrec[ray]")
         self._task: Any = None
         self._disconnect: weakref.finalize[Any, Any] | None = None
         self._is_shut_down = False

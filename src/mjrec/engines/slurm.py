@@ -36,11 +36,10 @@ from typing import Any
 
 from ..atomic_files import write_text
 from ..child_python import changed_environ
-from ..errors import ClosedError, Error, InvalidArgument, UnknownName
+from ..errors import ClosedError, Error, InvalidArgument, UnknownName, optional_module
 from ..machine import usable_cpus
 from ..plain_text import counted
-from .gpu_shares import GpuShare, check_worker_count, engine_package
-from .local import LocalEngine
+from .local import GpuShare, LocalEngine, check_worker_count
 from .worker import do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
@@ -483,7 +482,9 @@ def _submitit(cluster: str) -> Any:
     # submitit's messages.
     level = {"SUBMITIT_LOG_LEVEL": os.environ.get("SUBMITIT_LOG_LEVEL", "NOCONFIG")}
     with changed_environ(level):
-        submitit = engine_package("submitit", "slurm", install="mjrec[slurm]")
+        submitit = optional_module(
+            "submitit", purpose='engine="slurm"', install="mjrec[slurm]"
+        )
     missing = [command for command in _COMMANDS if shutil.which(command) is None]
     if cluster == "slurm" and missing:
         raise Error(

@@ -24,7 +24,7 @@ from .named_environment import (
 from .names import task_of_suite
 from .scenes import Scenes
 
-_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
+SUITE_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
@@ -59,25 +59,24 @@ def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
     if task not in tasks:
         raise UnknownName(f"dm_control {domain} task", task, tasks)
     for name in options.kwargs:
-        if name not in _ARGUMENTS:
+        if name not in SUITE_ARGUMENTS:
             raise UnknownName(
                 "dm_control environment argument",
                 name,
-                _ARGUMENTS,
+                SUITE_ARGUMENTS,
                 hint='For example {"task_kwargs": {"time_limit": 5}}.',
             )
     # suite.load accepts None for task_kwargs, so users may pass it.
     of_task = {"random": options.seed, **(options.kwargs.get("task_kwargs") or {})}
     try:
-        environment = load_task(env_id, {**options.kwargs, "task_kwargs": of_task})
+        kwargs = {**options.kwargs, "task_kwargs": of_task}
+        return load_task(env_id, kwargs, options)
     except Exception as error:
         raise dm_control_failure(env_id, error) from error
-    environment._step_limit = options.limit(environment._step_limit)
-    return environment
 
 
 def load_task(
-    env_id: str, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
+    env_id: str, kwargs: Mapping[str, Any] | None, options: EnvironmentOptions
 ) -> Any:
     """Create a task with `suite.load`.
 
@@ -85,16 +84,14 @@ def load_task(
         env_id: `dm_control/<domain>-<task>`.
         kwargs: arguments for `suite.load`; None if a recording lacks them. In that
             case, recordings of the returned environment also lack them.
-        limit: number of steps after which an episode ends as truncated, unless the task
-            ends it earlier.
+        options: the options, of which only `max_steps` applies.
     """
     environment = suite.load(*task_of_suite(env_id), **(kwargs or {}))
     if kwargs is not None:
         # An environment does not store the arguments used to create it.
         setattr(environment.task, MADE_WITH, kwargs)
-    if limit is not None:
-        # There is no public way to read or set a task's step limit.
-        environment._step_limit = min(limit, environment._step_limit)
+    # There is no public way to read or set a task's step limit.
+    environment._step_limit = options.limit(environment._step_limit) or np.inf
     return environment
 
 

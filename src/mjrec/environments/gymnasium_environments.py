@@ -71,9 +71,9 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
     # The module in `module:Id` may be in the working directory, like a policy's.
     here = working_directory_importable() if ":" in env_id else contextlib.nullcontext()
     with here:
-        spec = _spec(env_id)
+        spec = registered_spec(env_id)
         with _failures_of(spec.id):
-            return _made(spec, options)
+            return make_registered(spec, options)
 
 
 class GymnasiumEnvironment(NamedEnvironment):
@@ -110,11 +110,13 @@ class GymnasiumEnvironment(NamedEnvironment):
         return gymnasium_scenes(self.environment)
 
 
-def _made(
+def make_registered(
     spec: registration.EnvSpec, options: EnvironmentOptions
 ) -> gymnasium.Env[Any, Any]:
+    """Create the environment of a spec, without converting the errors of its code."""
     kwargs = dict(options.kwargs)
-    kwargs["max_episode_steps"] = options.limit(_own_limit(spec, kwargs))
+    # This is gymnasium.make's value for no limit.
+    kwargs["max_episode_steps"] = options.limit(_own_limit(spec, kwargs)) or -1
     if not options.frames:
         return gymnasium.make(spec.id, **kwargs)
     kwargs["render_mode"] = _render_mode(spec, kwargs)
@@ -157,7 +159,8 @@ def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | N
     return limit
 
 
-def _spec(env_id: str) -> registration.EnvSpec:
+def registered_spec(env_id: str) -> registration.EnvSpec:
+    """Import the module in `module:Id`, and return an id's spec in the registry."""
     module, colon, name = env_id.rpartition(":")
     if colon:
         try:

@@ -55,7 +55,8 @@ def make_mjcf(
         model=model,
         **options.size,
     )
-    return TimeLimit(environment, options.limit(None))
+    limit = options.limit(None)
+    return environment if limit is None else TimeLimit(environment, limit)
 
 
 class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):

@@ -16,7 +16,7 @@ from ..frames import check_size
 from .episode_seeds import EpisodeSeeds
 from .scenes import Scenes
 
-DEFAULT_MAX_STEPS = 1000
+_DEFAULT_MAX_STEPS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class EnvironmentOptions:
         width: width of the frames in pixels; None for the environment's own.
         max_steps: number of steps after which an episode ends as truncated. If the
             environment has its own limit, the smaller one applies. If both are missing,
-            the limit is 1000.
+            the limit is 1000. Infinity stands for no limit.
         frames: whether the environment will be drawn.
         seed: the run's seed, for random choices made when the environment is created.
         kwargs: additional arguments, in the form that this kind of environment accepts.
@@ -42,7 +42,7 @@ class EnvironmentOptions:
     camera: str | int | None = None
     height: int | None = None
     width: int | None = None
-    max_steps: int | None = None
+    max_steps: float | None = None
     frames: bool = True
     seed: int = 0
     kwargs: Mapping[str, Any] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class EnvironmentOptions:
         )
         steps = self.max_steps
         whole = isinstance(steps, int | np.integer) and not isinstance(steps, bool)
-        if steps is not None and (not whole or steps < 1):
+        if steps not in (None, np.inf) and (not whole or steps < 1):
             raise InvalidArgument(
                 f"max_steps must be a positive whole number, not {steps!r}."
             )
@@ -66,15 +66,16 @@ class EnvironmentOptions:
         sides = {"height": self.height, "width": self.width}
         return {name: side for name, side in sides.items() if side is not None}
 
-    def limit(self, own: float | None) -> int:
-        """Return the number of steps after which an episode ends.
+    def limit(self, own: float | None) -> int | None:
+        """Return the number of steps after which an episode ends; None for no limit.
 
         Args:
             own: the environment's own limit; None or infinity if it has none.
         """
-        limits = [limit for limit in (own, self.max_steps) if limit is not None]
-        smallest = min(limits, default=np.inf)
-        return DEFAULT_MAX_STEPS if smallest == np.inf else int(smallest)
+        smallest = min(np.inf if own is None else own, self.max_steps or np.inf)
+        if smallest == np.inf:
+            return _DEFAULT_MAX_STEPS if self.max_steps is None else None
+        return int(smallest)
 
 
 class Step(NamedTuple):

@@ -17,7 +17,6 @@ a model.zip or TorchScript file runs its code, so read only trusted files.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MissingDependency, PolicyError, UnknownName
+from ..errors import PolicyError, UnknownName, optional_module
 
 
 def file_of_policy(text: str) -> Path | None:
@@ -86,7 +85,7 @@ class _Model:
 
 
 def _stable_baselines3(path: Path, _environment: Any, *, device: str = "cpu") -> _Model:
-    saving = _library("stable_baselines3.common.save_util", path)
+    saving = _library("stable_baselines3.common.save_util", path, "stable-baselines3")
     # Arguments for learning may be functions that another Python version pickled.
     of_learning = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": None}
     data, weights, _ = saving.load_from_zip_file(
@@ -111,7 +110,7 @@ def _stable_baselines3(path: Path, _environment: Any, *, device: str = "cpu") ->
 def _torch(
     path: Path, environment: Any, *, device: str = "cpu"
 ) -> Callable[[Any], Any]:
-    torch = _library("torch", path)
+    torch = _library("torch", path, "torch")
     try:
         if path.suffix == ".pt2":
             module = torch.export.load(path).module().to(device)
@@ -132,7 +131,7 @@ def _torch(
 
 
 def _onnx(path: Path, environment: Any) -> Callable[[Any], Any]:
-    onnxruntime = _library("onnxruntime", path)
+    onnxruntime = _library("onnxruntime", path, "onnx")
     session = onnxruntime.InferenceSession(
         str(path), providers=["CPUExecutionProvider"]
     )
@@ -163,16 +162,9 @@ def _row(observation: Any) -> NDArray[np.float32]:
     return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
 
 
-def _library(name: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        package = name.partition(".")[0].replace("_", "-")
-        raise MissingDependency(
-            package,
-            purpose=f"Reading the policy {path}",
-            install=f'pip install "mjrec[{package.replace("runtime", "")}]"',
-        ) from error
+def _library(name: str, path: Path, extra: str) -> Any:
+    purpose = f"Reading the policy {path}"
+    return optional_module(name, purpose=purpose, install=f"mjrec[{extra}]")
 
 
 _READERS: Mapping[str, Callable[..., Any]] = {

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from ..formats.trajectory import columns_of
+from .gymnasium_environments import make_registered, registered_spec
 from .gymnasium_scenes import drawn_part, random_state, set_own_camera
+from .named_environment import EnvironmentOptions
 from .scenes import class_name, generator_state, set_generator_state, simulation_below
 from .wrapping import StandIn, stand_ins
 
@@ -48,9 +50,6 @@ _LARGEST = 1e9
 # The limit for numbers that affect memory or time: frames, skipped frames, stacks. A
 # suite task's `random` is a seed, so the limit does not apply to it.
 _LARGEST_COUNT = 10_000
-
-_SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
-_SUITE_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 class NotRecreated(Exception):
@@ -241,8 +240,8 @@ def _gymnasium(
     limit: int | None,
     trusted: str | None,
 ) -> gymnasium.Env[Any, Any]:
-    entry_point = _entry_point(env_id)
-    if trusted is None and not any(_is_below(entry_point, each) for each in _TRUSTED):
+    spec = _known_spec(env_id) if trusted is None else registered_spec(trusted)
+    if spec is None:
         raise _lacking(
             f"this would run code from the archive: {env_id!r:.100} is not one of the "
             "environments of Gymnasium, Gymnasium-Robotics or dm_control that are "
@@ -257,13 +256,13 @@ def _gymnasium(
                 f"its argument {name!r:.80} ({value!r:.80}) is not a plain "
                 "value within bounds, or names a file"
             )
-    return gymnasium.make(
-        trusted or env_id,
-        # gymnasium.make's value for no limit.
-        max_episode_steps=-1 if limit is None else limit,
-        disable_env_checker=True,
-        **kwargs,
-    )
+    # The recorded limit replaces the registered one; -1 is gymnasium.make's for none.
+    of_make = {"max_episode_steps": limit or -1, "disable_env_checker": True}
+    return make_registered(spec, _options(None, kwargs={**kwargs, **of_make}))
+
+
+def _options(limit: int | None, **others: Any) -> EnvironmentOptions:
+    return EnvironmentOptions(max_steps=limit or np.inf, frames=False, **others)
 
 
 def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
@@ -306,37 +305,40 @@ def _mjcf(
     path: Path, model: Any, kwargs: Mapping[str, Any], limit: int | None
 ) -> gymnasium.Env[Any, Any]:
     # Not imported at the top, because it loads MuJoCo.
-    from .mjcf_environments import MjcfEnvironment
+    from .mjcf_environments import make_mjcf
 
     size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
-    env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
-    return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
+    return make_mjcf(path, _options(limit, **size), model)
 
 
 def _dm_control(
     env_id: str, kwargs: Mapping[str, Any] | None, limit: int | None
 ) -> Recreated:
-    if not _is_in_suite(env_id):
+    names: Collection[str] = ()
+    # If dm_control does not work, none of its tasks counts as installed.
+    with contextlib.suppress(Exception):
+        from .dm_control_environments import SUITE_ARGUMENTS, load_task, suite
+
+        names = {f"dm_control/{domain}-{task}" for domain, task in suite.ALL_TASKS}
+    if env_id not in names:
         raise _lacking(
             f"{env_id!r:.100} is not a task of the installed dm_control suite, or "
             'dm_control does not work here: pip install "mjrec[dm-control]"'
         )
     for key, value in (kwargs or {}).items():
         parts = value if isinstance(value, Mapping) else {key: value}
-        if key not in _SUITE_ARGUMENTS or not _are_plain(parts):
+        if key not in SUITE_ARGUMENTS or not _are_plain(parts):
             raise _lacking(
                 f"its argument {key!r:.80} ({value!r:.80}) is not a plain value "
                 "within bounds"
             )
-    from .dm_control_environments import load_task
-
     task_kwargs = (kwargs or {}).get("task_kwargs") or {}
     if env_id.startswith("dm_control/lqr-") and "random" not in task_kwargs:
         raise _lacking(
             f"{env_id} chooses its model at random when it is created, and the "
             "seed for this is not recorded"
         )
-    env = load_task(env_id, kwargs, limit=limit)
+    env = load_task(env_id, kwargs, _options(limit))
     return Recreated(environment=env, is_dm_env=True)
 
 
@@ -370,31 +372,19 @@ def _is_plain(value: Any, left: list[int]) -> bool:
     return isinstance(value, int | float) and abs(value) <= _LARGEST
 
 
-def _entry_point(env_id: str) -> Any:
-    """Return the entry point of an id in the installed registry, or None."""
+def _known_spec(env_id: str) -> registration.EnvSpec | None:
+    """Return an id's spec if it is in the installed registry and trusted, or None."""
     spec = registration.registry.get(env_id)
     if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
         # The package registers its environments on import. The name is our constant.
         with contextlib.suppress(Exception):
             importlib.import_module(_ROBOTICS)
         spec = registration.registry.get(env_id)
-    return None if spec is None else spec.entry_point
-
-
-def _is_below(entry_point: Any, package: str) -> bool:
-    module = entry_point.partition(":")[0] if isinstance(entry_point, str) else ""
-    return f"{module}.".startswith(f"{package}.")
-
-
-def _is_in_suite(env_id: str) -> bool:
-    """Return whether an id refers to a task in the installed suite."""
-    # If dm_control does not work, none of its tasks counts as installed.
-    with contextlib.suppress(Exception):
-        from .dm_control_environments import suite
-
-        match = _SUITE_NAME.fullmatch(env_id)
-        return bool(match and match.groups() in suite.ALL_TASKS)
-    return False
+    if spec is None or not isinstance(spec.entry_point, str):
+        return None
+    module = spec.entry_point.partition(":")[0]
+    is_trusted = any(f"{module}.".startswith(f"{each}.") for each in _TRUSTED)
+    return spec if is_trusted else None
 
 
 @contextlib.contextmanager

@@ -90,6 +90,11 @@ class EpisodeResult:
         return self.total_reward
 
     @property
+    def name(self) -> str:
+        """The name for people."""
+        return f"{self.task} seed {self.seed} episode {self.episode}"
+
+    @property
     def unit(self) -> tuple[int, int]:
         """The seed and episode number, which identify the episode within its task."""
         return self.seed, self.episode

@@ -16,6 +16,7 @@ when complete. It then replaces an existing folder if that contains only a repor
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 import shutil
@@ -26,11 +27,13 @@ from typing import Final
 from ..atomic_files import make_directory, temporary_path, write_text
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from ..formats.regular_files import open_regular
-from ..plain_text import listed
+from ..plain_text import counted, listed
 from . import media
 from .contents import ReportContents
 from .gathering import Directories, gather
 from .page import page_of
+
+logger = logging.getLogger(__name__)
 
 PAGE_NAME: Final = "index.html"
 
@@ -97,6 +100,10 @@ def write_report(
     _check_target(target, is_page=is_page)
     tell = on_progress or (lambda progress: None)
     contents = gather(directories, title=title, verifications=verifications)
+    for task in contents.tasks:
+        if count := task.summary.not_finite:
+            what = counted(count, "return")
+            logger.warning("NaN or infinite: %s of %r.", what, task.name)
     media.add_images(contents, tell)
     if single_file:
         page = _single_page(contents, max_single_file_bytes)
