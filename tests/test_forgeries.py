@@ -751,6 +751,7 @@ def claim_wrapper(run):
 CLAIMS = {
     "another Gymnasium": claim_version("gymnasium", "1.1.1"),
     "another MuJoCo": claim_version("mujoco", "3.5.0"),
+    "another HDF5": claim_version("h5py", "3.14.0"),
     "another machine": claim_machine,
     "another GPU": claim_gpu,
     "another ffmpeg": claim_ffmpeg,
@@ -961,9 +962,9 @@ EDITED = {
             line,
         )
         for what, lie, claim, line in (
-            ("text after a trajectory", add_to_the_end, "Gymnasium", "space outside"),
-            ("a dataset deleted", hide_in_hdf5, "Gymnasium", "space outside"),
-            ("text in a chunk", add_to_a_chunk, "Gymnasium", "space outside"),
+            ("text after a trajectory", add_to_the_end, "HDF5", "space outside"),
+            ("a dataset deleted", hide_in_hdf5, "HDF5", "space outside"),
+            ("text in a chunk", add_to_a_chunk, "HDF5", "space outside"),
             ("a name in a model's file", name_in_gzip, "machine", "gzip header"),
             ("a stream after a model", add_a_gzip_stream, "machine", "gzip stream"),
         )
@@ -1124,7 +1125,7 @@ BELIEVED = {
 }
 
 # Where nothing need differ, nothing was excused.
-HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg")
+HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg", "another HDF5")
 
 
 def rows(table):
