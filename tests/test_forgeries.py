@@ -10,6 +10,7 @@ import gzip
 import json
 import re
 import shutil
+import struct
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -529,12 +530,44 @@ def put_another_model_before(run):
             archive.writestr(info, content)
 
 
-def swap_the_model(run):
-    """Sources of a lighter robot."""
-    run.rewrite_zip(
-        run.the("*.model.*.zip"),
-        lambda content: content.replace(b'size=".05"', b'size=".04"'),
-    )
+# Sources of a lighter robot.
+swap_the_model = methodcaller(
+    "rewrite_zip", lambda content: content.replace(b'size=".05"', b'size=".04"')
+)
+
+
+def extra_in_sources(run):
+    """A field that holds a time elsewhere."""
+
+    def edit(info):
+        info.extra = b"UT" + struct.pack("<H", 9) + b"succeeded"
+
+    run.rewrite_zip(beside=edit)
+
+
+def time_in_sources(run):
+    """In the header of a file, which programs ignore for the table of contents."""
+    path = run.the("*.model.*.zip")
+    content = bytearray(path.read_bytes())
+    content[10:14] = b"best"
+    path.write_bytes(content)
+
+
+def after_sources(run):
+    """After the compressed data of a file, where programs do not look."""
+    path, text = run.the("*.model.*.zip"), b"All succeeded."
+    with zipfile.ZipFile(path) as archive:
+        last, table = archive.infolist()[-1], archive.start_dir
+    content = path.read_bytes()
+    content = bytearray(content[:table] + text + content[table:])
+    size, entry = last.compress_size + len(text), content.rindex(b"PK\1\2")
+    for place, value in (
+        (last.header_offset + 18, size),
+        (entry + 20, size),
+        (len(content) - 6, table + len(text)),
+    ):
+        struct.pack_into("<L", content, place, value)
+    path.write_bytes(content)
 
 
 def hide_arguments(run):
@@ -769,6 +802,7 @@ IMPOSSIBLE = {
 }
 FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
 OF_NOTHING = ("environment", "1.0")
+BESIDE = "more than its content"
 
 
 # What is recorded, and packed.
@@ -967,6 +1001,9 @@ EDITED = {
             ("text in a chunk", add_to_a_chunk, "HDF5", "space outside"),
             ("a name in a model's file", name_in_gzip, "machine", "gzip header"),
             ("a stream after a model", add_a_gzip_stream, "machine", "gzip stream"),
+            ("an extra field in sources", extra_in_sources, "machine", BESIDE),
+            ("a time in sources", time_in_sources, "machine", BESIDE),
+            ("text after a file in sources", after_sources, "machine", BESIDE),
         )
     },
     # Additions.
