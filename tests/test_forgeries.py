@@ -271,13 +271,16 @@ def swap_the_ending(run):
 # Lies about videos.
 
 
-def paint_a_spot(run, episode, frame=-1):
+def paint(run, episode=1, *, at=slice(None), side=3):
+    """Blacken a square in some frames."""
     frames = [one.copy() for one in run.frames(episode)]
-    frames[frame][12:15, 12:15] = 0
+    for one in frames[at]:
+        one[12 : 12 + side, 12 : 12 + side] = 0
     run.film(episode, frames)
 
 
-one_spot = partial(paint_a_spot, episode=1, frame=2)
+one_spot = partial(paint, at=slice(2, 3))
+black_squares = each(2, partial(paint, side=8))
 
 
 def negative(run, episode=1, **said):
@@ -287,14 +290,6 @@ def negative(run, episode=1, **said):
 def refilm(change):
     """Film frames of what `change` makes of those of the second episode."""
     return lambda run: run.film(1, change(run.frames(1)))
-
-
-def all_of_a_video(run):
-    """A spot in each of its frames."""
-    frames = [one.copy() for one in run.frames(1)]
-    for one in frames:
-        one[12:15, 12:15] = 0
-    run.film(1, frames)
 
 
 hide_the_fall = refilm(lambda frames: frames[:-2])
@@ -924,8 +919,19 @@ EDITED = {
         f"a spot painted, with {name} claimed": both(one_spot, claim)
         for name, claim in CLAIMS.items()
     },
+    **{
+        f"a black square in all frames, with {name} claimed": (
+            both(black_squares, claim),
+            r"different pictures .* levels in the worst block",
+        )
+        for name, claim in (
+            ("another GPU", claim_gpu),
+            ("another build of llvmpipe", claim_llvmpipe),
+            ("another machine", claim_machine),
+        )
+    },
     "a pixel of each video changed, with another ffmpeg claimed": (
-        both(each(2, paint_a_spot), claim_ffmpeg),
+        both(each(2, partial(paint, at=slice(-1, None))), claim_ffmpeg),
         "hash",
     ),
     "a frame rate 3 percent off, as the metadata says": (
@@ -938,7 +944,7 @@ EDITED = {
         "7 frames of recording 0.u are equal bit for bit",
     ),
     "a spot in all frames of a video, with another build of llvmpipe claimed": (
-        both(all_of_a_video, claim_llvmpipe),
+        both(paint, claim_llvmpipe),
         "frames of recording 0.u are equal bit for bit",
     ),
     "the fall not shown": (hide_the_fall, "frames"),

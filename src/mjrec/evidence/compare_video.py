@@ -198,7 +198,8 @@ class Worst:
     """Compares pairs of frames and keeps the largest differences."""
 
     def __init__(self) -> None:
-        self._plain, self._lit, self._shadow = _EQUAL, _EQUAL, 0.0
+        self._plain, self._lit = _EQUAL, _EQUAL
+        self._shadow = self._patch = 0.0
         self._differing, self._worst = 0, 0
         self.strain = 0.0
 
@@ -211,8 +212,9 @@ class Worst:
         found = similarity(one, other)
         lit = found
         if OTHER_CPU.strain(found) > 1:
-            but, share = but_for_shadows(one, other)
+            but, share, patch = but_for_shadows(one, other)
             self._shadow = max(self._shadow, share)
+            self._patch = max(self._patch, patch)
             lit = similarity(one, but)
         self._plain, self._lit = _lower(self._plain, found), _lower(self._lit, lit)
         if (strain := OTHER_ENCODER.strain(found)) > self.strain:
@@ -235,6 +237,7 @@ class Worst:
                 **plain._asdict(),
                 **{f"{name}_lit": value for name, value in lit._asdict().items()},
                 "shadow": self._shadow,
+                "patch": self._patch,
                 "worst_frame": self._worst,
             },
         )
