@@ -50,10 +50,10 @@ class Forgery:
     """A row of the table."""
 
     what: str
+    # What is said of it, a regular expression.
+    line: str
     # Edits a monitor directory before it is packed.
     lie: Callable | None = None
-    # What is said of it, a regular expression.
-    line: str = ""
     # Records the run that is edited.
     of: Callable = honest.pendulum
     # Edits the packed run, whose lists are made to fit afterwards.
@@ -376,19 +376,32 @@ def encoded_with(arguments):
 
 # The same frames: only the file, or its times, are others.
 OF_FILES = {
-    "twice the speed, as the metadata says": methodcaller(
-        "film", 1, fps="50", playback_speed=2.0
+    "twice the speed, as the metadata says": (
+        methodcaller("film", 1, fps="50", playback_speed=2.0),
+        "playback_speed: the archive has 2.0",
     ),
-    "twice the speed, called real time": swift_in_real_time,
-    "a frame that stands": bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"),
-    "a second track on top": second_track,
-    "a commentary": mux(*SINE, "-map", "0:v", "-map", "1:a", "-c:v", "copy"),
-    "a title in the file": mux("-c", "copy", *TITLE, metadata="0"),
-    "a video turned": rotation,
-    "wide pixels": bitstream("h264_metadata=sample_aspect_ratio=4/1"),
+    "twice the speed, called real time": (swift_in_real_time, "times: the archive has"),
+    "a frame that stands": (
+        bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"),
+        "times: .* not all shown for the same duration",
+    ),
+    "a second track on top": (second_track, "2 boxes 'stts'"),
+    "a commentary": (
+        mux(*SINE, "-map", "0:v", "-map", "1:a", "-c:v", "copy"),
+        "2 boxes 'stts'",
+    ),
+    "a title in the file": (mux("-c", "copy", *TITLE, metadata="0"), "udta: .* title"),
+    "a video turned": (rotation, "tkhd: .* turned"),
+    "wide pixels": (
+        bitstream("h264_metadata=sample_aspect_ratio=4/1"),
+        "avc1: .* shape of its pixels",
+    ),
     # What happens at the right is not shown.
-    "a video cropped": bitstream("h264_metadata=crop_right=16"),
-    "bytes at the end of a video": hidden_bytes,
+    "a video cropped": (
+        bitstream("h264_metadata=crop_right=16"),
+        "size.*: the archive has .* W16 H32",
+    ),
+    "bytes at the end of a video": (hidden_bytes, "boxes: the archive has free"),
 }
 
 
@@ -872,6 +885,8 @@ QUICK = {
     *("a note in the recordings", "README claims more"),
 }
 
+A_FRAME_MORE = (double_a_frame, "times: the archive has 5 frames")
+
 # Of the usual run, with the verdict FAIL: what the liar did, how, what is said of it.
 EDITED = {
     "rewards doubled": (double_rewards, "reward"),
@@ -888,12 +903,16 @@ EDITED = {
         )
     },
     **{
-        f"{what}, with a wrapper claimed": both(lie, claim_wrapper)
-        for what, lie in (
-            ("a state of an ulp", edit_a_state),
-            ("another seed", name_another_seed),
-            ("the fall not shown", hide_the_fall),
-            ("last states called unknown", repeat_last_states),
+        f"{what}{also}": (both(lie, claim), line)
+        for also, claim in (
+            ("", lambda run: None),
+            (", with a wrapper claimed", claim_wrapper),
+        )
+        for what, lie, line in (
+            ("a state of an ulp", edit_a_state, r"physics .* states\[2\]\.qpos"),
+            ("another seed", name_another_seed, r"beginning .* states\[0\]"),
+            ("the fall not shown", hide_the_fall, "times: the archive has 2 frames"),
+            ("last states called unknown", repeat_last_states, "archive has nan"),
         )
     },
     "a return doubled, with a wrapper claimed": (
@@ -901,22 +920,34 @@ EDITED = {
         "reward",
     ),
     "success added to the journal": (call_it_successful, "success"),
-    "last states called unknown": (repeat_last_states, "state"),
-    "cut before the fall": cut,
-    "cut before the fall, called a limit": cut_as_by_a_limit,
-    "a state of an ulp": (edit_a_state, "qpos|qvel|states"),
-    "an action edited": edit_an_action,
-    "another seed": name_another_seed,
-    "a beginning of one's own, its seed forgotten": forget_the_seed,
-    "two episodes in the other order": swap_episodes,
-    "one episode shown as two": lambda run: show_one_as_two(run, seed=99),
-    "the worst left out, the others renumbered": leave_the_worst_out,
+    "cut before the fall": (cut, r'"length": 2.* run has \{"cut"'),
+    "cut before the fall, called a limit": (
+        cut_as_by_a_limit,
+        r'"length": 2.* run has \{"cut"',
+    ),
+    "an action edited": (edit_an_action, r'"length": 3.* run has \{"cut"'),
+    "a beginning of one's own, its seed forgotten": (
+        forget_the_seed,
+        "random_state: the archive has None",
+    ),
+    "two episodes in the other order": (swap_episodes, r"schedule\.recorded\[0\]"),
+    "one episode shown as two": (
+        lambda run: show_one_as_two(run, seed=99),
+        r"beginning episode 3 .* states\[0\]",
+    ),
+    "the worst left out, the others renumbered": (
+        leave_the_worst_out,
+        r"episode 1\.chosen: only the recreated run",
+    ),
     "the first left out": (leave_the_first_out, "begins with episode 1"),
     "fall called a limit of time": (swap_the_ending, "terminated|truncated"),
     # Videos.
     "a spot painted": (one_spot, "frame 2"),
     **{
-        f"a spot painted, with {name} claimed": both(one_spot, claim)
+        f"a spot painted, with {name} claimed": (
+            both(one_spot, claim),
+            r"different .* frame 2: its hash|different .* claimed to be",
+        )
         for name, claim in CLAIMS.items()
     },
     **{
@@ -947,18 +978,15 @@ EDITED = {
         both(paint, claim_llvmpipe),
         "frames of recording 0.u are equal bit for bit",
     ),
-    "the fall not shown": (hide_the_fall, "frames"),
-    "a frame doubled": (double_a_frame, "frames"),
+    "a frame doubled": A_FRAME_MORE,
     "a frame replaced": (refilm(lambda f: [*f[:2], f[1], *f[3:]]), "frame 2"),
-    "videos swapped": swap_videos,
-    "a negative called a clip": negative_as_clip,
-    "a negative called live": live_and_doctored,
+    "videos swapped": (swap_videos, "pictures episode 0 .* frame 0: its hash"),
+    "a negative called a clip": (negative_as_clip, "only the archive has it: .*000003"),
+    "a negative called live": (live_and_doctored, "recording: the archive has live"),
     **OF_FILES,
-    "a second track on top": (second_track, "track|tables"),
-    "a commentary": (OF_FILES["a commentary"], "track|tables"),
     **{
-        f"{what}, with another ffmpeg claimed": both(lie, claim_ffmpeg)
-        for what, lie in (*OF_FILES.items(), ("a frame doubled", double_a_frame))
+        f"{what}, with another ffmpeg claimed": (both(lie, claim_ffmpeg), line)
+        for what, (lie, line) in {**OF_FILES, "a frame doubled": A_FRAME_MORE}.items()
     },
     **{
         what: (both(encoded_with(f"h264_metadata={said}"), claim_ffmpeg), line)
@@ -968,26 +996,49 @@ EDITED = {
             ("videos turned in the stream", TURNED, "frame"),
         )
     },
-    "negatives of all videos, with another GPU claimed": both(
-        each(2, negative), claim_gpu
+    **{
+        f"{what}, with another GPU claimed": (
+            both(lie, claim_gpu),
+            "different pictures .* levels in the worst block",
+        )
+        for what, lie in (
+            ("negatives of all videos", each(2, negative)),
+            ("videos swapped", swap_videos),
+        )
+    },
+    "small frames called large": (
+        refilm(lambda f: [*map(scaled_up, f)]),
+        "20 levels in the worst block",
     ),
-    "videos swapped, with another GPU claimed": both(swap_videos, claim_gpu),
-    "small frames called large": refilm(lambda f: [*map(scaled_up, f)]),
-    "draft called full": draft_called_full,
-    "a close-up added": add_a_close_up,
-    "a video called broken": (call_it_broken, "no such file"),
-    "a video left out, the schedule blamed": (blame_the_schedule, "no such"),
-    "a video left out, a fault blamed": (blame_a_fault, "videos.* no such"),
+    "draft called full": (draft_called_full, "frame 0: its hash differs"),
+    "a close-up added": (add_a_close_up, "only the archive has it: .*close.mp4"),
+    **{
+        what: (lie, "videos .* only the recreated run has it: .*000001.mp4")
+        for what, lie in (
+            ("a video called broken", call_it_broken),
+            ("a video left out, the schedule blamed", blame_the_schedule),
+            ("a video left out, a fault blamed", blame_a_fault),
+            ("a scheduled video left out", choose_by_hand),
+        )
+    },
     # What was chosen, and identity.
-    "another schedule named": replaced("capped_cubic_video_schedule", "every:2"),
-    "a scheduled video left out": choose_by_hand,
-    "another environment named": replaced(PENDULUM, "Hopper-v5"),
+    "another schedule named": (
+        replaced("capped_cubic_video_schedule", "every:2"),
+        r"episode 1\.chosen: only the archive",
+    ),
+    "another environment named": (
+        replaced(PENDULUM, "Hopper-v5"),
+        "playing failed: .*Action dimension",
+    ),
     # In what people read; it is made by its own id.
     "another name": (replaced(PENDULUM, "Humanoid-v5", key="env_id"), "its name is"),
-    "called one's own environment": replaced(PENDULUM, "MyPendulum-v0"),
-    "called gym's": pretend_to_be_gym,
+    "called one's own environment": (
+        replaced(PENDULUM, "MyPendulum-v0"),
+        "cannot be recreated: .* --trust MyPendulum-v0",
+    ),
+    "called gym's": (pretend_to_be_gym, "journal does not name its environment"),
     "a second file in a model's sources": (put_another_model_before, "zip"),
-    "evaluation called training": call_it_trained,
+    "evaluation called training": (call_it_trained, "archive has it: .*000002.h5"),
     # Claims without a lie.
     "another MuJoCo claimed": (CLAIMS["another MuJoCo"], "is claimed to be"),
     "another GPU claimed": (claim_gpu, "is claimed to be"),
@@ -1038,8 +1089,8 @@ EDITED = {
 
 # Of the usual run, when it was packed; the lists of the bag are made to fit.
 PACKED = {
-    "the worst's video called pending": pending_worst,
-    "a video called made smaller": say_it_was_made_smaller,
+    "the worst's video called pending": (pending_worst, "pending: the archive has"),
+    "a video called made smaller": (say_it_was_made_smaller, "packed_smaller: only"),
     "a line about rows": (add_a_line_about_rows, "goals"),
     "a note beside the data": (add_a_file("notes.txt"), "notes.txt"),
     "a note in the data": (add_a_file("data/notes.txt"), "notes.txt"),
@@ -1079,12 +1130,12 @@ PACKED = {
 # Recorded of an environment that is not what its name says.
 DOCTORED = {
     "rewards doubled by a wrapper that is not named": (lying.double_reward, "reward"),
-    "falls that do not end an episode": lying.never_fall,
-    "a pole that is held": lying.push,
-    "a heavier robot": lying.make_heavy,
-    "played on the moon": lying.raise_gravity,
-    "every episode a success": lying.always_succeed,
-    "a body made invisible": lying.hide_the_pole,
+    "falls that do not end an episode": (lying.never_fall, "terminated: the archive"),
+    "a pole that is held": (lying.push, r"0\.length: the archive has 5"),
+    "a heavier robot": (lying.make_heavy, r"0\.length: the archive has 4"),
+    "played on the moon": (lying.raise_gravity, r"0\.length: the archive has 4"),
+    "every episode a success": (lying.always_succeed, "success: the archive has True"),
+    "a body made invisible": (lying.hide_the_pole, "model_changes/0/geom_rgba"),
 }
 
 # Of other runs.
@@ -1095,9 +1146,13 @@ OTHERS = {
     "rewards doubled of an episode whose encoder was killed": (
         *(honest.encoder_killed, partial(double_rewards_of, episode=1), "reward"),
     ),
-    "an end cut off without a fault": (honest.end_lost, leave_faults_out, ""),
+    "an end cut off without a fault": (
+        honest.end_lost,
+        leave_faults_out,
+        r'"length": 200.* run has \{"cut"',
+    ),
     "an end cut off, with a fault of another episode": (
-        *(honest.end_lost, blame_another_episode, ""),
+        *(honest.end_lost, blame_another_episode, r'"length": 200.* run has \{"cut"'),
     ),
     "rewards doubled before a fault": (
         *(honest.end_lost, partial(double_rewards_of, episode=1), "reward"),
@@ -1114,11 +1169,13 @@ OTHERS = {
     "an option that no reset can be given, of a killed recording": (
         *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION), "of a reset"),
     ),
-    "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
-    "the best called the worst": (best, replaced("best:1", "worst:1"), ""),
-    "the worst of an evaluation called its best": (evaluated_and_swapped, None, ""),
-    "arguments hidden": (noiseless, hide_arguments, ""),
-    "another model's sources": (honest.mjcf, swap_the_model, ""),
+    "actions called float64": (honest.cheetah, each(3, call_it_double), r"0\.reward"),
+    "the best called the worst": (best, replaced("best:1", "worst:1"), r"2\.recording"),
+    "the worst of an evaluation called its best": (
+        *(evaluated_and_swapped, None, 'only the archive has it: .*"rule": "best"'),
+    ),
+    "arguments hidden": (noiseless, hide_arguments, r"0\.length"),
+    "another model's sources": (honest.mjcf, swap_the_model, "compiled differently"),
     "a key in the manifest, with a schedule of one's own": (
         *(by_hand, add_to_manifest, "award"),
     ),
@@ -1136,7 +1193,8 @@ BELIEVED = {
         r"differ from the controls.* \[wrappers\]",
     ),
     "cut before the fall, with a wrapper claimed": (
-        *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper), ""),
+        *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper)),
+        r"end flags of 1 of its steps differ.* \[wrappers\]",
     ),
     "one episode shown as two, with its seed": (
         *(honest.pendulum, show_one_as_two, "same episode"),
@@ -1171,24 +1229,24 @@ BELIEVED = {
 HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg", "another HDF5")
 
 
-def rows(table):
-    """Yield what, how, and what is said of it, if that is given."""
-    for what, given in table.items():
-        yield (what, *(given if isinstance(given, tuple) else (given, "")))
-
-
 FORGERIES = (
-    *(Forgery(what, lie, line) for what, lie, line in rows(EDITED)),
-    *(Forgery(what, bag=bag, line=line) for what, bag, line in rows(PACKED)),
-    *(Forgery(w, of=doctored(change), line=line) for w, change, line in rows(DOCTORED)),
+    *(Forgery(what, line, lie) for what, (lie, line) in EDITED.items()),
+    *(Forgery(what, line, bag=bag) for what, (bag, line) in PACKED.items()),
     *(
-        Forgery(what, lie, line, of=of, verdict=verdict)
+        Forgery(what, line, of=doctored(change))
+        for what, (change, line) in DOCTORED.items()
+    ),
+    *(
+        Forgery(what, line, lie, of=of, verdict=verdict)
         for verdict, forgeries in ((FAIL, OTHERS), (PARTLY, BELIEVED))
         for what, (of, lie, line) in forgeries.items()
     ),
-    *(Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS) for name in HARMLESS),
     *(
-        Forgery(f"rewards doubled, {how}", double_rewards, "reward", packing=packing)
+        Forgery(f"{name} claimed", r"noted .* \[", CLAIMS[name], verdict=PASS)
+        for name in HARMLESS
+    ),
+    *(
+        Forgery(f"rewards doubled, {how}", "reward", double_rewards, packing=packing)
         for how, packing in (
             ("of episodes that were not chosen for packing", {"episodes": [0]}),
             ("anonymously", {"anonymous": True}),
@@ -1196,22 +1254,22 @@ FORGERIES = (
     ),
     Forgery(
         "a claim in the README beside versions, with another MuJoCo claimed",
+        "README",
         CLAIMS["another MuJoCo"],
         bag=replace_in("README.md", "| versions | ", "| versions | best policy, "),
-        line="README",
     ),
     Forgery(
         "a return in the table, beside an environment of one's own",
+        "statistics.csv",
         lambda run: replace_in_second(run, '"id": "InvertedP', '"id": "MyP'),
         of=honest.several,
         bag=edit_the_table,
-        line="statistics.csv",
     ),
     Forgery(
         "an option of packing that tells more",
+        "packing options",
         packing={"anonymous": True},
         bag=tell_in_options,
-        line="packing options",
     ),
 )
 

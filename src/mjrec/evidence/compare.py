@@ -35,7 +35,7 @@ from .compare_models import (
 )
 from .compare_rows import compare_trajectories, same_trajectory
 from .compare_video import compare_frame_hashes, compare_sampled, compare_videos
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, only_in, short
 from .excuses import applicable, is_fed, merged, noted_excuse, read_notes, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .honesty import remarks_on_video
@@ -47,7 +47,6 @@ _Found: TypeAlias = Iterator[Same | Difference]
 # Keys of a manifest that rendering changes.
 _DRAWN_KEYS: Final = frozenset(("videos", "pending", "broken"))
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-_NOT_MADE: Final = "this file was not recreated"
 
 
 def _compare_manifests(given: Path, made: Path, rules: Rules) -> _Found:
@@ -224,9 +223,7 @@ class Comparison:
             file=file,
             # A compiled model missing from the archive is not excused.
             aspect=Aspect.MODEL if ending == ".mjb.gz" and is_given else Aspect.EXACT,
-            how=_NOT_MADE
-            if is_given
-            else "the archive has no such file, but one was recreated",
+            how=only_in(is_given, Path(file).name),
         )
 
     def _is_unplayed(self, model: str) -> bool:

@@ -192,6 +192,13 @@ def _compare_lines(
         named = given.get("episode_id")
         episode = named if type(named) is int else None
         where = f"line {number}" if episode is None else f"episode {episode}"
+        if next(iter(given), "") != next(iter(made), ""):
+            # They report different kinds of events.
+            texts = (line.decode(errors="replace").strip() for line in (one, other))
+            yield Difference(
+                Topic.REWARDS, where=where, how=unlike(*texts), episode=episode
+            )
+            return
         found = list(json_differences(given, made, rules, where=where, episode=episode))
         yield from found or [STORED_DIFFERENTLY]
     if not found and episode is not None:

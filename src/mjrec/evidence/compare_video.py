@@ -12,6 +12,7 @@ import functools
 import hashlib
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .compare_json import Rules, lines_of
-from .differences import Aspect, Difference, Same, differs, short
+from .differences import Aspect, Difference, Same, differs
 from .findings import Topic
 from .frame_similarity import (
     OTHER_CPU,
@@ -40,6 +41,14 @@ from .mp4_videos import Box, decoded_video, odd_contents, read_boxes, shown_time
 _ENCODED: Final = frozenset(
     ("mdat", "avcC", "btrt", "stsz", "stsc", "stco", "co64", "stss", "ctts", "elst")
 )
+_MEANINGS: Final = {
+    "mvhd": "how long it is and how fast it plays",
+    "mdhd": "how long it is",
+    "tkhd": "how long it is shown, how large, and how it is turned",
+    "avc1": "the size and the shape of its pixels",
+    "stts": "when its frames are shown",
+    "udta": "its title and other texts",
+}
 # Present only if frames are stored out of order or are not all key frames.
 _OPTIONAL: Final = frozenset(("ctts", "stss"))
 _LONGEST_HASHES: Final = 1 << 28
@@ -91,13 +100,15 @@ def _compare_boxes(given: Sequence[Box], made: Sequence[Box]) -> Iterator[Differ
     kept = [[b for b in boxes if b.name not in _OPTIONAL] for boxes in (given, made)]
     paths = [[box.path for box in boxes] for boxes in kept]
     if paths[0] != paths[1]:
-        extra = [path for path in paths[0] if path not in paths[1]] or paths[0]
-        missing = [path for path in paths[1] if path not in paths[0]] or paths[1]
-        yield _differs("boxes", short(", ".join(extra)), ", ".join(missing))
+        counts = [Counter(each) for each in paths]
+        more = [one - other for one, other in (counts, counts[::-1])]
+        yield _differs("boxes", *(", ".join(each) or "no other" for each in more))
         return
     for one, other in zip(*kept, strict=True):
         if one.name not in _ENCODED and one.content != other.content:
-            yield _differs(one.path, one.content.hex(), other.content.hex())
+            means = _MEANINGS.get(one.name, "more")
+            how = f"the bytes that say {means} differ"
+            yield Difference(Topic.VIDEOS, unit="video", where=one.path, how=how)
 
 
 def _compare_frames(
@@ -106,7 +117,7 @@ def _compare_frames(
     worst, digest = Worst(), hashlib.sha256()
     with decoded_video(given) as (header, one), decoded_video(made) as (again, other):
         if header != again:
-            yield _differs("the stream", header, again)
+            yield _differs("size, rate and shape of pixels", header, again)
             return
         for number, (a, b) in enumerate(itertools.zip_longest(one, other)):
             if a is None or b is None:
