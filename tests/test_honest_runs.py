@@ -11,6 +11,7 @@ from parts import parametrize
 
 import honest_runs as honest
 import mjrec
+from mjrec.commands import main
 from mjrec.evidence.findings import Verdict
 
 PASS, PARTLY = Verdict.PASS, Verdict.PARTLY
@@ -87,6 +88,16 @@ def test_honest_run_comes_out_again(
     assert found.verdict is verdict, said
     assert {each.name for each in found.excuses} == set(believed), said
     assert ("at a smaller size for packing" in said) == ("max_size" in packing), said
+
+
+@pytest.mark.thorough
+def test_excuse_that_the_reader_accepts_does_not_lower_the_verdict(tmp_path, capsys):
+    """By its value: a wrapper of another name is not accepted."""
+    honest.wrapped_in_code(tmp_path / "run")
+    archive = str(mjrec.pack(tmp_path / "run", tmp_path / "run.zip"))
+    for value, status in (("TransformReward", 0), ("ClipReward", 3)):
+        assert main(["verify", archive, "--allow", f"wrappers={value}"]) == status
+        assert ("allowed" in capsys.readouterr().out) == (status == 0)
 
 
 def packed_elsewhere(record, into, python=sys.executable, **environ):
