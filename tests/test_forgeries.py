@@ -251,6 +251,10 @@ def say_an_option(run, **options):
     run.edit_journal(lambda lines: lines[0]["run"]["options"].update(options))
 
 
+def say_a_random_state(run):
+    run.edit_rows(1, facts={"random_state": {"bit_generator": "of luck"}})
+
+
 def name_an_argument(run):
     """That no version of the environment takes."""
 
@@ -806,6 +810,7 @@ IMPOSSIBLE = {
     "an exact rate": (partial(say_an_option, max_fps="1/0"), "max_fps.*1/0"),
     "a camera": (partial(say_an_option, camera="no_such"), "different .*no_such"),
     "an argument": (name_an_argument, "different .*no_such"),
+    "a random state": (say_a_random_state, "different .*random state does not fit"),
     "an option": (methodcaller("say", 1, options=NO_PLAIN_OPTION), "different .*reset"),
 }
 FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
@@ -1028,7 +1033,7 @@ EDITED = {
     ),
     "another environment named": (
         replaced(PENDULUM, "Hopper-v5"),
-        "playing failed: .*Action dimension",
+        "cannot be recreated: .*Action dimension",
     ),
     # In what people read; it is made by its own id.
     "another name": (replaced(PENDULUM, "Humanoid-v5", key="env_id"), "its name is"),
