@@ -36,11 +36,13 @@ from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
 from mjrec.rendering.chosen_videos import write_choice
 from mjrec.rendering.jobs import RecordingKey
+from mjrec.trackers import MonitorCsvTracker
 
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
 PENDULUM = "InvertedPendulum-v5"
 TURNED = "display_orientation=insert:rotate=180"
 DEVICE = {"index": 0, "note": "all succeeded"}
+X264 = "dc45e9bde6d948b7962cd820d923eeef"
 SINE = ("-f", "lavfi", "-i", "sine=duration=0.1")
 TITLE = ("-metadata", "title=Success rate 100 %")
 
@@ -407,6 +409,60 @@ OF_FILES = {
     ),
     "bytes at the end of a video": (hidden_bytes, "boxes: the archive has free"),
 }
+
+
+def say_it_in_the_stream(run, episode):
+    """In the message of the encoder, whose id it has."""
+    text = f"h264_metadata=sei_user_data={X264}+All_goals_were_reached"
+    filters = f"filter_units=remove_types=6,{text}"
+    run.film(episode, encoder_arguments=("-x264-params", "me=dia", "-bsf:v", filters))
+
+
+def hide_among_frames(run, episode):
+    """In the box of the frames, where no frame is."""
+    run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
+    content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
+    place = content.rindex(b"mdat") - 4
+    [size] = struct.unpack_from(">L", content, place)
+    assert place + size == len(content)
+    struct.pack_into(">L", content, place, size + len(text))
+    run.video(episode).write_bytes(content + text)
+    run.rehash(episode)
+
+
+def add_to_parameters(run, episode):
+    """After the parameters of the stream, which players stop at."""
+    run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
+    content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
+    place = end = content.index(b"avcC") - 4
+    end += struct.unpack_from(">L", content, place)[0]
+    enlarged = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1", b"avcC")
+    places, at = [], content.index(b"moov")
+    for name in enlarged:
+        at = content.index(name, at)
+        places.append(at - 4)
+    stco = content.index(b"stco") + 4
+    [chunks] = struct.unpack_from(">L", content, stco + 4)
+    for at in (*places, *range(stco + 8, stco + 8 + 4 * chunks, 4)):
+        [size] = struct.unpack_from(">L", content, at)
+        struct.pack_into(">L", content, at, size + len(text))
+    run.video(episode).write_bytes(content[:end] + text + content[end:])
+    run.rehash(episode)
+
+
+def write_with_spaces(run):
+    """Say something in what no reader of JSON sees."""
+    for pattern in ("*.jsonl", "*.stats.json", "*000001.meta.json"):
+        for path in run.directory.glob(pattern):
+            text = path.read_text()
+            path.write_text(text.replace(": ", ":  ", 1))
+
+
+def edit_the_csv(run):
+    path = run.the("*.monitor.csv")
+    header, names, first, *rest = path.read_text().splitlines()
+    first = "99" + first
+    path.write_text("\n".join([header, names, first, *rest]) + "\n")
 
 
 def add_a_close_up(run):
@@ -835,6 +891,10 @@ def noiseless(directory):
     honest.pendulum(directory, make={"reset_noise_scale": 0.0})
 
 
+def with_csv(directory):
+    honest.pendulum(directory, trackers=MonitorCsvTracker())
+
+
 def best(directory):
     honest.kept(directory, rule="best:1")
 
@@ -1068,6 +1128,21 @@ EDITED = {
             ("text after a file in sources", after_sources, "machine", BESIDE),
         )
     },
+    **{
+        f"{what}, with another ffmpeg claimed": (
+            both(each(2, lie), claim_ffmpeg),
+            line,
+        )
+        for what, lie, line in (
+            ("a message of the encoder", say_it_in_the_stream, "messages"),
+            ("text among the frames", hide_among_frames, "more than its frames"),
+            ("text after the parameters of a stream", add_to_parameters, "avcC"),
+        )
+    },
+    "spaces in JSON, with another Gymnasium claimed": (
+        both(CLAIMS["another Gymnasium"], write_with_spaces),
+        "not written as mjrec writes",
+    ),
     # Additions.
     "a dataset added": (
         in_hdf5(lambda file: file.create_dataset("success", data=np.ones(3))),
@@ -1100,6 +1175,10 @@ PACKED = {
     "a note beside the data": (add_a_file("notes.txt"), "notes.txt"),
     "a note in the data": (add_a_file("data/notes.txt"), "notes.txt"),
     "a note in the recordings": (add_a_file("data/recordings/notes.txt"), "notes.txt"),
+    "words in the date": (
+        replace_in("bag-info.txt", "Bagging-Date: ", "Bagging-Date: all reached "),
+        "bag-info",
+    ),
     "a video of no recording": (add_a_video, "does not belong to a recording"),
     "README claims more": (
         replace_in("README.md", "## Videos", "All reached the goal.\n\n## Videos"),
@@ -1145,6 +1224,7 @@ DOCTORED = {
 
 # Of other runs.
 OTHERS = {
+    "a return in the monitor.csv": (with_csv, edit_the_csv, "monitor.csv"),
     "rewards doubled of an episode that was cut off": (
         *(honest.early, double_rewards_cut_off, "reward"),
     ),

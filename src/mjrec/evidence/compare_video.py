@@ -90,7 +90,7 @@ def compare_videos(
         how="it was encoded differently",
     )
     frames = [*_compare_frames(given, made, rules)]
-    frames += [_differs(*each) for each in odd_contents(given)]
+    frames += [_differs(*each) for each in odd_contents(given, made)]
     yield from frames
     if not found and not any(each.topic is Topic.VIDEOS for each in frames):
         yield Same(Topic.VIDEOS, unit="video")
