@@ -43,6 +43,8 @@ PENDULUM = "InvertedPendulum-v5"
 TURNED = "display_orientation=insert:rotate=180"
 DEVICE = {"index": 0, "note": "all succeeded"}
 X264 = "dc45e9bde6d948b7962cd820d923eeef"
+# Where the parameters of a stream are.
+BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1", b"avcC")
 SINE = ("-f", "lavfi", "-i", "sine=duration=0.1")
 TITLE = ("-metadata", "title=Success rate 100 %")
 
@@ -131,8 +133,7 @@ def cut(run, **facts):
     run.film(1)
 
 
-def cut_as_by_a_limit(run):
-    cut(run, truncated=True)
+cut_as_by_a_limit = partial(cut, truncated=True)
 
 
 def edit_a_state(run):
@@ -418,51 +419,40 @@ def say_it_in_the_stream(run, episode):
     run.film(episode, encoder_arguments=("-x264-params", "me=dia", "-bsf:v", filters))
 
 
-def hide_among_frames(run, episode):
-    """In the box of the frames, where no frame is."""
+def hide_in_box(run, episode, *path):
+    """At the end of a box in the file of a video, where no program looks."""
     run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
     content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
-    place = content.rindex(b"mdat") - 4
-    [size] = struct.unpack_from(">L", content, place)
-    assert place + size == len(content)
-    struct.pack_into(">L", content, place, size + len(text))
-    run.video(episode).write_bytes(content + text)
-    run.rehash(episode)
-
-
-def add_to_parameters(run, episode):
-    """After the parameters of the stream, which players stop at."""
-    run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
-    content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
-    place = end = content.index(b"avcC") - 4
-    end += struct.unpack_from(">L", content, place)[0]
-    enlarged = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1", b"avcC")
-    places, at = [], content.index(b"moov")
-    for name in enlarged:
+    numbers, at = [], 0
+    for name in path:
         at = content.index(name, at)
-        places.append(at - 4)
-    stco = content.index(b"stco") + 4
-    [chunks] = struct.unpack_from(">L", content, stco + 4)
-    for at in (*places, *range(stco + 8, stco + 8 + 4 * chunks, 4)):
-        [size] = struct.unpack_from(">L", content, at)
-        struct.pack_into(">L", content, at, size + len(text))
+        numbers.append(at - 4)
+    end = numbers[-1] + struct.unpack_from(">L", content, numbers[-1])[0]
+    if end < len(content):
+        # The frames move.
+        chunks = content.index(b"stco") + 8
+        [count] = struct.unpack_from(">L", content, chunks)
+        numbers += range(chunks + 4, chunks + 4 + 4 * count, 4)
+    for at in numbers:
+        [number] = struct.unpack_from(">L", content, at)
+        struct.pack_into(">L", content, at, number + len(text))
     run.video(episode).write_bytes(content[:end] + text + content[end:])
     run.rehash(episode)
 
 
+def in_box(*path):
+    return lambda run, episode: hide_in_box(run, episode, *path)
+
+
 def write_with_spaces(run):
     """Say something in what no reader of JSON sees."""
-    for pattern in ("*.jsonl", "*.stats.json", "*000001.meta.json"):
-        for path in run.directory.glob(pattern):
-            text = path.read_text()
-            path.write_text(text.replace(": ", ":  ", 1))
+    text = run.metadata(1).read_text()
+    run.metadata(1).write_text(text.replace(": ", ":  ", 1))
 
 
 def edit_the_csv(run):
     path = run.the("*.monitor.csv")
-    header, names, first, *rest = path.read_text().splitlines()
-    first = "99" + first
-    path.write_text("\n".join([header, names, first, *rest]) + "\n")
+    path.write_text(path.read_text().replace("\n2.0,", "\n9.0,"))
 
 
 def add_a_close_up(run):
@@ -672,9 +662,16 @@ def hide_in_hdf5(run):
     in_hdf5(lambda file: file.pop("note"))(run)
 
 
-def add_to_the_end(run):
-    with run.trajectory(1).open("ab") as file:
-        file.write(b"All goals were reached. " * 20)
+def at_the_end(pattern, content):
+    def lie(run):
+        with run.the(pattern).open("ab") as file:
+            file.write(content)
+
+    return lie
+
+
+add_to_the_end = at_the_end("*000001.h5", b"All goals were reached. " * 20)
+add_a_gzip_stream = at_the_end("*.mjb.gz", gzip.compress(b"", mtime=0))
 
 
 def add_to_a_chunk(run):
@@ -694,11 +691,6 @@ def name_in_gzip(run):
     content = gzip.decompress(path.read_bytes())
     with path.open("wb") as file, gzip.GzipFile("succeeds", "wb", 9, file, 0) as model:
         model.write(content)
-
-
-def add_a_gzip_stream(run):
-    with run.the("*.mjb.gz").open("ab") as file:
-        file.write(gzip.compress(b"", mtime=0))
 
 
 def add_to(pattern):
@@ -1135,8 +1127,8 @@ EDITED = {
         )
         for what, lie, line in (
             ("a message of the encoder", say_it_in_the_stream, "messages"),
-            ("text among the frames", hide_among_frames, "more than its frames"),
-            ("text after the parameters of a stream", add_to_parameters, "avcC"),
+            ("text among the frames", in_box(b"mdat"), "more than its frames"),
+            ("text after the parameters of a stream", in_box(*BOXES), "avcC"),
         )
     },
     "spaces in JSON, with another Gymnasium claimed": (
