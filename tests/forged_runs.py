@@ -88,13 +88,15 @@ class ForgedRun:
             episode_types=[line["type"] for line in complete],
         )
 
-    def rewrite_zip(self, path, change):
-        """Change what the sources of a model hold."""
+    def rewrite_zip(self, change=lambda content: content, beside=lambda info: None):
+        """Change what the sources of a model hold, or what stands beside that."""
+        path = self.the("*.model.*.zip")
         with zipfile.ZipFile(path) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
+            members = [(info, archive.read(info)) for info in archive.infolist()]
         with zipfile.ZipFile(path, "w") as archive:
-            for name, content in members.items():
-                archive.writestr(name, change(content))
+            for info, content in members:
+                beside(info)
+                archive.writestr(info, change(content))
 
     def edit_rows(self, episode, *, facts=(), **arrays):
         """Write a trajectory anew, with other facts, arrays and dtypes of `PARTS`.

@@ -192,10 +192,14 @@ EDITS = [
     (in_text("bag-info.txt", NOTED.split("\n")[0], NOTED), Topic.FILES, "line"),
     (
         lambda bag: (bag / "data" / "notes.txt").write_text("best"),
-        *(Topic.FILES, "this file was not recreated"),
+        *(Topic.FILES, "only the archive has it: notes.txt"),
     ),
-    (removed("*video000001.framehash"), Topic.PICTURES, "no such file"),
-    (removed("*episode000001.h5"), Topic.PHYSICS, "no such file"),
+    (
+        removed("*video000001.framehash"),
+        Topic.PICTURES,
+        "only the recreated run has it",
+    ),
+    (removed("*episode000001.h5"), Topic.PHYSICS, "only the recreated run has it"),
     (in_states(3, "qpos", 1e-12), Topic.PHYSICS, "states[3].qpos"),
     (in_states(0, "qvel", 1e-12), Topic.BEGINNING, "states[0].qvel"),
     (another_reward, Topic.REWARDS, "rewards[2]"),

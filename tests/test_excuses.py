@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excuses: what each allows, where, and up to which size."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from mjrec.errors import InvalidArgument
+from mjrec.evidence.compare_video import Worst
 from mjrec.evidence.differences import Aspect, Difference
 from mjrec.evidence.excuses import applicable, excuse_of, merged, with_allowed
 from mjrec.evidence.findings import Outcome, Topic
+from mjrec.evidence.frame_similarity import planes_of
 from mjrec.evidence.trial import Trial
 
 RECORDING = "recording 0.u"
@@ -21,6 +26,7 @@ EXCUSES = {
     "numpy": ("numpy", "2.3.0", "2.4.0", RECORDING),
     "gymnasium": ("gymnasium", "1.3.0", "1.4.0", RECORDING),
     "python": ("python", "3.12.1", "3.11.7", RECORDING),
+    "hdf5": ("hdf5", "1.14.6", "2.0.0"),
     "h100": ("gl", "NVIDIA H100", "llvmpipe", RECORDING),
     "llvmpipe": ("gl", "llvmpipe (LLVM 17)", "llvmpipe (LLVM 15)", RECORDING),
     "ffmpeg": ("ffmpeg", "7.0", "9.0", RECORDING),
@@ -36,8 +42,9 @@ def difference(aspect, size=None, **changes):
     return Difference(**{**usual, **changes}, aspect=aspect, size=size)
 
 
-def frame(psnr, block, *, shadow=0.0):
-    figures = {"psnr": psnr, "ssim": 0.99, "block": block, "shadow": shadow}
+def frame(psnr, block, **shadow):
+    figures = {"psnr": psnr, "ssim": 0.99, "block": block, "shadow": 0.0, "patch": 0.0}
+    figures |= shadow
     lit = {"psnr_lit": 40.0, "ssim_lit": 0.99, "block_lit": 9.0}
     return difference(
         Aspect.PICTURE, topic=Topic.PICTURES, file=VIDEO, figures={**figures, **lit}
@@ -76,6 +83,8 @@ def reward(aspect, size=None):
         ("python", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("python", difference(Aspect.CLAIM, claim="python"), NOTED),
         ("python", difference(Aspect.CLAIM, claim="numpy"), DIFFERENT),
+        ("hdf5", difference(Aspect.STORED), NOTED),
+        ("hdf5", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("h100", frame(30.0, 30.0), WITHIN),
         ("h100", frame(27.0, 30.0), DIFFERENT),
         ("h100", frame(27.0, 100.0, shadow=0.02), WITHIN),
@@ -85,6 +94,11 @@ def reward(aspect, size=None):
         ("llvmpipe", frame(36.0, 12.0), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.001), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.02), DIFFERENT),
+        # A black square of 8x8 pixels, of a frame of 480x480 and of one of 64x64.
+        ("llvmpipe", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
+        ("machine", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
+        ("h100", frame(48.0, 70.0, shadow=0.001, patch=0.017), WITHIN),
+        ("h100", frame(40.0, 70.0, shadow=0.016, patch=0.125), DIFFERENT),
         ("ffmpeg", frame(36.0, 12.0), WITHIN),
         # Frames are hashed before they are encoded.
         ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), DIFFERENT),
@@ -105,6 +119,21 @@ def reward(aspect, size=None):
 def test_an_excuse_allows_what_it_states(name, found, outcome):
     """In its own items, up to its tolerance, and nothing else."""
     assert Trial([excuse_of(*EXCUSES[name])]).judge(found).outcome is outcome
+
+
+@pytest.mark.parametrize(
+    ("name", "side"), [("llvmpipe", 8), ("machine", 8), ("h100", 28)]
+)
+def test_a_black_square_is_no_shadow(name, side):
+    """In the middle of a body, in a frame of which it is less than half a percent."""
+    lit = np.full((480, 480, 3), 150, np.uint8)
+    painted = lit.copy()
+    painted[200 : 200 + side, 200 : 200 + side] = 0
+    worst = Worst()
+    worst.add(0, planes_of(painted), planes_of(lit))
+    [found] = worst.differences()
+    trial = Trial([excuse_of(*EXCUSES[name])])
+    assert trial.judge(replace(found, file=VIDEO)).outcome is DIFFERENT
 
 
 def test_the_widest_excuse_decides():

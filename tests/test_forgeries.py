@@ -10,6 +10,7 @@ import gzip
 import json
 import re
 import shutil
+import struct
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -35,11 +36,15 @@ from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
 from mjrec.rendering.chosen_videos import write_choice
 from mjrec.rendering.jobs import RecordingKey
+from mjrec.trackers import MonitorCsvTracker
 
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
 PENDULUM = "InvertedPendulum-v5"
 TURNED = "display_orientation=insert:rotate=180"
 DEVICE = {"index": 0, "note": "all succeeded"}
+X264 = "dc45e9bde6d948b7962cd820d923eeef"
+# Where the parameters of a stream are.
+BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1", b"avcC")
 SINE = ("-f", "lavfi", "-i", "sine=duration=0.1")
 TITLE = ("-metadata", "title=Success rate 100 %")
 
@@ -49,10 +54,10 @@ class Forgery:
     """A row of the table."""
 
     what: str
+    # What is said of it, a regular expression.
+    line: str
     # Edits a monitor directory before it is packed.
     lie: Callable | None = None
-    # What is said of it, a regular expression.
-    line: str = ""
     # Records the run that is edited.
     of: Callable = honest.pendulum
     # Edits the packed run, whose lists are made to fit afterwards.
@@ -128,8 +133,7 @@ def cut(run, **facts):
     run.film(1)
 
 
-def cut_as_by_a_limit(run):
-    cut(run, truncated=True)
+cut_as_by_a_limit = partial(cut, truncated=True)
 
 
 def edit_a_state(run):
@@ -250,6 +254,10 @@ def say_an_option(run, **options):
     run.edit_journal(lambda lines: lines[0]["run"]["options"].update(options))
 
 
+def say_a_random_state(run):
+    run.edit_rows(1, facts={"random_state": {"bit_generator": "of luck"}})
+
+
 def name_an_argument(run):
     """That no version of the environment takes."""
 
@@ -270,13 +278,16 @@ def swap_the_ending(run):
 # Lies about videos.
 
 
-def paint_a_spot(run, episode, frame=-1):
+def paint(run, episode=1, *, at=slice(None), side=3):
+    """Blacken a square in some frames."""
     frames = [one.copy() for one in run.frames(episode)]
-    frames[frame][12:15, 12:15] = 0
+    for one in frames[at]:
+        one[12 : 12 + side, 12 : 12 + side] = 0
     run.film(episode, frames)
 
 
-one_spot = partial(paint_a_spot, episode=1, frame=2)
+one_spot = partial(paint, at=slice(2, 3))
+black_squares = each(2, partial(paint, side=8))
 
 
 def negative(run, episode=1, **said):
@@ -286,14 +297,6 @@ def negative(run, episode=1, **said):
 def refilm(change):
     """Film frames of what `change` makes of those of the second episode."""
     return lambda run: run.film(1, change(run.frames(1)))
-
-
-def all_of_a_video(run):
-    """A spot in each of its frames."""
-    frames = [one.copy() for one in run.frames(1)]
-    for one in frames:
-        one[12:15, 12:15] = 0
-    run.film(1, frames)
 
 
 hide_the_fall = refilm(lambda frames: frames[:-2])
@@ -380,20 +383,76 @@ def encoded_with(arguments):
 
 # The same frames: only the file, or its times, are others.
 OF_FILES = {
-    "twice the speed, as the metadata says": methodcaller(
-        "film", 1, fps="50", playback_speed=2.0
+    "twice the speed, as the metadata says": (
+        methodcaller("film", 1, fps="50", playback_speed=2.0),
+        "playback_speed: the archive has 2.0",
     ),
-    "twice the speed, called real time": swift_in_real_time,
-    "a frame that stands": bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"),
-    "a second track on top": second_track,
-    "a commentary": mux(*SINE, "-map", "0:v", "-map", "1:a", "-c:v", "copy"),
-    "a title in the file": mux("-c", "copy", *TITLE, metadata="0"),
-    "a video turned": rotation,
-    "wide pixels": bitstream("h264_metadata=sample_aspect_ratio=4/1"),
+    "twice the speed, called real time": (swift_in_real_time, "times: the archive has"),
+    "a frame that stands": (
+        bitstream("setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)"),
+        "times: .* not all shown for the same duration",
+    ),
+    "a second track on top": (second_track, "2 boxes 'stts'"),
+    "a commentary": (
+        mux(*SINE, "-map", "0:v", "-map", "1:a", "-c:v", "copy"),
+        "2 boxes 'stts'",
+    ),
+    "a title in the file": (mux("-c", "copy", *TITLE, metadata="0"), "udta: .* title"),
+    "a video turned": (rotation, "tkhd: .* turned"),
+    "wide pixels": (
+        bitstream("h264_metadata=sample_aspect_ratio=4/1"),
+        "avc1: .* shape of its pixels",
+    ),
     # What happens at the right is not shown.
-    "a video cropped": bitstream("h264_metadata=crop_right=16"),
-    "bytes at the end of a video": hidden_bytes,
+    "a video cropped": (
+        bitstream("h264_metadata=crop_right=16"),
+        "size.*: the archive has .* W16 H32",
+    ),
+    "bytes at the end of a video": (hidden_bytes, "boxes: the archive has free"),
 }
+
+
+def say_it_in_the_stream(run, episode):
+    """In the message of the encoder, whose id it has."""
+    text = f"h264_metadata=sei_user_data={X264}+All_goals_were_reached"
+    filters = f"filter_units=remove_types=6,{text}"
+    run.film(episode, encoder_arguments=("-x264-params", "me=dia", "-bsf:v", filters))
+
+
+def hide_in_box(run, episode, *path):
+    """At the end of a box in the file of a video, where no program looks."""
+    run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
+    content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
+    numbers, at = [], 0
+    for name in path:
+        at = content.index(name, at)
+        numbers.append(at - 4)
+    end = numbers[-1] + struct.unpack_from(">L", content, numbers[-1])[0]
+    if end < len(content):
+        # The frames move.
+        chunks = content.index(b"stco") + 8
+        [count] = struct.unpack_from(">L", content, chunks)
+        numbers += range(chunks + 4, chunks + 4 + 4 * count, 4)
+    for at in numbers:
+        [number] = struct.unpack_from(">L", content, at)
+        struct.pack_into(">L", content, at, number + len(text))
+    run.video(episode).write_bytes(content[:end] + text + content[end:])
+    run.rehash(episode)
+
+
+def in_box(*path):
+    return lambda run, episode: hide_in_box(run, episode, *path)
+
+
+def write_with_spaces(run):
+    """Say something in what no reader of JSON sees."""
+    text = run.metadata(1).read_text()
+    run.metadata(1).write_text(text.replace(": ", ":  ", 1))
+
+
+def edit_the_csv(run):
+    path = run.the("*.monitor.csv")
+    path.write_text(path.read_text().replace("\n2.0,", "\n9.0,"))
 
 
 def add_a_close_up(run):
@@ -529,12 +588,44 @@ def put_another_model_before(run):
             archive.writestr(info, content)
 
 
-def swap_the_model(run):
-    """Sources of a lighter robot."""
-    run.rewrite_zip(
-        run.the("*.model.*.zip"),
-        lambda content: content.replace(b'size=".05"', b'size=".04"'),
-    )
+# Sources of a lighter robot.
+swap_the_model = methodcaller(
+    "rewrite_zip", lambda content: content.replace(b'size=".05"', b'size=".04"')
+)
+
+
+def extra_in_sources(run):
+    """A field that holds a time elsewhere."""
+
+    def edit(info):
+        info.extra = b"UT" + struct.pack("<H", 9) + b"succeeded"
+
+    run.rewrite_zip(beside=edit)
+
+
+def time_in_sources(run):
+    """In the header of a file, which programs ignore for the table of contents."""
+    path = run.the("*.model.*.zip")
+    content = bytearray(path.read_bytes())
+    content[10:14] = b"best"
+    path.write_bytes(content)
+
+
+def after_sources(run):
+    """After the compressed data of a file, where programs do not look."""
+    path, text = run.the("*.model.*.zip"), b"All succeeded."
+    with zipfile.ZipFile(path) as archive:
+        last, table = archive.infolist()[-1], archive.start_dir
+    content = path.read_bytes()
+    content = bytearray(content[:table] + text + content[table:])
+    size, entry = last.compress_size + len(text), content.rindex(b"PK\1\2")
+    for place, value in (
+        (last.header_offset + 18, size),
+        (entry + 20, size),
+        (len(content) - 6, table + len(text)),
+    ):
+        struct.pack_into("<L", content, place, value)
+    path.write_bytes(content)
 
 
 def hide_arguments(run):
@@ -571,9 +662,16 @@ def hide_in_hdf5(run):
     in_hdf5(lambda file: file.pop("note"))(run)
 
 
-def add_to_the_end(run):
-    with run.trajectory(1).open("ab") as file:
-        file.write(b"All goals were reached. " * 20)
+def at_the_end(pattern, content):
+    def lie(run):
+        with run.the(pattern).open("ab") as file:
+            file.write(content)
+
+    return lie
+
+
+add_to_the_end = at_the_end("*000001.h5", b"All goals were reached. " * 20)
+add_a_gzip_stream = at_the_end("*.mjb.gz", gzip.compress(b"", mtime=0))
 
 
 def add_to_a_chunk(run):
@@ -593,11 +691,6 @@ def name_in_gzip(run):
     content = gzip.decompress(path.read_bytes())
     with path.open("wb") as file, gzip.GzipFile("succeeds", "wb", 9, file, 0) as model:
         model.write(content)
-
-
-def add_a_gzip_stream(run):
-    with run.the("*.mjb.gz").open("ab") as file:
-        file.write(gzip.compress(b"", mtime=0))
 
 
 def add_to(pattern):
@@ -751,6 +844,7 @@ def claim_wrapper(run):
 CLAIMS = {
     "another Gymnasium": claim_version("gymnasium", "1.1.1"),
     "another MuJoCo": claim_version("mujoco", "3.5.0"),
+    "another HDF5": claim_version("h5py", "3.14.0"),
     "another machine": claim_machine,
     "another GPU": claim_gpu,
     "another ffmpeg": claim_ffmpeg,
@@ -764,10 +858,12 @@ IMPOSSIBLE = {
     "an exact rate": (partial(say_an_option, max_fps="1/0"), "max_fps.*1/0"),
     "a camera": (partial(say_an_option, camera="no_such"), "different .*no_such"),
     "an argument": (name_an_argument, "different .*no_such"),
+    "a random state": (say_a_random_state, "different .*random state does not fit"),
     "an option": (methodcaller("say", 1, options=NO_PLAIN_OPTION), "different .*reset"),
 }
 FALSE_CLAIMS = [name for name in CLAIMS if name != "a wrapper"]
 OF_NOTHING = ("environment", "1.0")
+BESIDE = "more than its content"
 
 
 # What is recorded, and packed.
@@ -785,6 +881,10 @@ def doctored(change, of=honest.pendulum):
 
 def noiseless(directory):
     honest.pendulum(directory, make={"reset_noise_scale": 0.0})
+
+
+def with_csv(directory):
+    honest.pendulum(directory, trackers=MonitorCsvTracker())
 
 
 def best(directory):
@@ -842,6 +942,8 @@ QUICK = {
     *("a note in the recordings", "README claims more"),
 }
 
+A_FRAME_MORE = (double_a_frame, "times: the archive has 5 frames")
+
 # Of the usual run, with the verdict FAIL: what the liar did, how, what is said of it.
 EDITED = {
     "rewards doubled": (double_rewards, "reward"),
@@ -858,12 +960,16 @@ EDITED = {
         )
     },
     **{
-        f"{what}, with a wrapper claimed": both(lie, claim_wrapper)
-        for what, lie in (
-            ("a state of an ulp", edit_a_state),
-            ("another seed", name_another_seed),
-            ("the fall not shown", hide_the_fall),
-            ("last states called unknown", repeat_last_states),
+        f"{what}{also}": (both(lie, claim), line)
+        for also, claim in (
+            ("", lambda run: None),
+            (", with a wrapper claimed", claim_wrapper),
+        )
+        for what, lie, line in (
+            ("a state of an ulp", edit_a_state, r"physics .* states\[2\]\.qpos"),
+            ("another seed", name_another_seed, r"beginning .* states\[0\]"),
+            ("the fall not shown", hide_the_fall, "times: the archive has 2 frames"),
+            ("last states called unknown", repeat_last_states, "archive has nan"),
         )
     },
     "a return doubled, with a wrapper claimed": (
@@ -871,26 +977,49 @@ EDITED = {
         "reward",
     ),
     "success added to the journal": (call_it_successful, "success"),
-    "last states called unknown": (repeat_last_states, "state"),
-    "cut before the fall": cut,
-    "cut before the fall, called a limit": cut_as_by_a_limit,
-    "a state of an ulp": (edit_a_state, "qpos|qvel|states"),
-    "an action edited": edit_an_action,
-    "another seed": name_another_seed,
-    "a beginning of one's own, its seed forgotten": forget_the_seed,
-    "two episodes in the other order": swap_episodes,
-    "one episode shown as two": lambda run: show_one_as_two(run, seed=99),
-    "the worst left out, the others renumbered": leave_the_worst_out,
+    "cut before the fall": (cut, r'"length": 2.* run has \{"cut"'),
+    "cut before the fall, called a limit": (
+        cut_as_by_a_limit,
+        r'"length": 2.* run has \{"cut"',
+    ),
+    "an action edited": (edit_an_action, r'"length": 3.* run has \{"cut"'),
+    "a beginning of one's own, its seed forgotten": (
+        forget_the_seed,
+        "random_state: the archive has None",
+    ),
+    "two episodes in the other order": (swap_episodes, r"schedule\.recorded\[0\]"),
+    "one episode shown as two": (
+        lambda run: show_one_as_two(run, seed=99),
+        r"beginning episode 3 .* states\[0\]",
+    ),
+    "the worst left out, the others renumbered": (
+        leave_the_worst_out,
+        r"episode 1\.chosen: only the recreated run",
+    ),
     "the first left out": (leave_the_first_out, "begins with episode 1"),
     "fall called a limit of time": (swap_the_ending, "terminated|truncated"),
     # Videos.
     "a spot painted": (one_spot, "frame 2"),
     **{
-        f"a spot painted, with {name} claimed": both(one_spot, claim)
+        f"a spot painted, with {name} claimed": (
+            both(one_spot, claim),
+            r"different .* frame 2: its hash|different .* claimed to be",
+        )
         for name, claim in CLAIMS.items()
     },
+    **{
+        f"a black square in all frames, with {name} claimed": (
+            both(black_squares, claim),
+            r"different pictures .* levels in the worst block",
+        )
+        for name, claim in (
+            ("another GPU", claim_gpu),
+            ("another build of llvmpipe", claim_llvmpipe),
+            ("another machine", claim_machine),
+        )
+    },
     "a pixel of each video changed, with another ffmpeg claimed": (
-        both(each(2, paint_a_spot), claim_ffmpeg),
+        both(each(2, partial(paint, at=slice(-1, None))), claim_ffmpeg),
         "hash",
     ),
     "a frame rate 3 percent off, as the metadata says": (
@@ -903,21 +1032,18 @@ EDITED = {
         "7 frames of recording 0.u are equal bit for bit",
     ),
     "a spot in all frames of a video, with another build of llvmpipe claimed": (
-        both(all_of_a_video, claim_llvmpipe),
+        both(paint, claim_llvmpipe),
         "frames of recording 0.u are equal bit for bit",
     ),
-    "the fall not shown": (hide_the_fall, "frames"),
-    "a frame doubled": (double_a_frame, "frames"),
+    "a frame doubled": A_FRAME_MORE,
     "a frame replaced": (refilm(lambda f: [*f[:2], f[1], *f[3:]]), "frame 2"),
-    "videos swapped": swap_videos,
-    "a negative called a clip": negative_as_clip,
-    "a negative called live": live_and_doctored,
+    "videos swapped": (swap_videos, "pictures episode 0 .* frame 0: its hash"),
+    "a negative called a clip": (negative_as_clip, "only the archive has it: .*000003"),
+    "a negative called live": (live_and_doctored, "recording: the archive has live"),
     **OF_FILES,
-    "a second track on top": (second_track, "track|tables"),
-    "a commentary": (OF_FILES["a commentary"], "track|tables"),
     **{
-        f"{what}, with another ffmpeg claimed": both(lie, claim_ffmpeg)
-        for what, lie in (*OF_FILES.items(), ("a frame doubled", double_a_frame))
+        f"{what}, with another ffmpeg claimed": (both(lie, claim_ffmpeg), line)
+        for what, (lie, line) in {**OF_FILES, "a frame doubled": A_FRAME_MORE}.items()
     },
     **{
         what: (both(encoded_with(f"h264_metadata={said}"), claim_ffmpeg), line)
@@ -927,26 +1053,49 @@ EDITED = {
             ("videos turned in the stream", TURNED, "frame"),
         )
     },
-    "negatives of all videos, with another GPU claimed": both(
-        each(2, negative), claim_gpu
+    **{
+        f"{what}, with another GPU claimed": (
+            both(lie, claim_gpu),
+            "different pictures .* levels in the worst block",
+        )
+        for what, lie in (
+            ("negatives of all videos", each(2, negative)),
+            ("videos swapped", swap_videos),
+        )
+    },
+    "small frames called large": (
+        refilm(lambda f: [*map(scaled_up, f)]),
+        "20 levels in the worst block",
     ),
-    "videos swapped, with another GPU claimed": both(swap_videos, claim_gpu),
-    "small frames called large": refilm(lambda f: [*map(scaled_up, f)]),
-    "draft called full": draft_called_full,
-    "a close-up added": add_a_close_up,
-    "a video called broken": (call_it_broken, "no such file"),
-    "a video left out, the schedule blamed": (blame_the_schedule, "no such"),
-    "a video left out, a fault blamed": (blame_a_fault, "videos.* no such"),
+    "draft called full": (draft_called_full, "frame 0: its hash differs"),
+    "a close-up added": (add_a_close_up, "only the archive has it: .*close.mp4"),
+    **{
+        what: (lie, "videos .* only the recreated run has it: .*000001.mp4")
+        for what, lie in (
+            ("a video called broken", call_it_broken),
+            ("a video left out, the schedule blamed", blame_the_schedule),
+            ("a video left out, a fault blamed", blame_a_fault),
+            ("a scheduled video left out", choose_by_hand),
+        )
+    },
     # What was chosen, and identity.
-    "another schedule named": replaced("capped_cubic_video_schedule", "every:2"),
-    "a scheduled video left out": choose_by_hand,
-    "another environment named": replaced(PENDULUM, "Hopper-v5"),
+    "another schedule named": (
+        replaced("capped_cubic_video_schedule", "every:2"),
+        r"episode 1\.chosen: only the archive",
+    ),
+    "another environment named": (
+        replaced(PENDULUM, "Hopper-v5"),
+        "cannot be recreated: .*Action dimension",
+    ),
     # In what people read; it is made by its own id.
     "another name": (replaced(PENDULUM, "Humanoid-v5", key="env_id"), "its name is"),
-    "called one's own environment": replaced(PENDULUM, "MyPendulum-v0"),
-    "called gym's": pretend_to_be_gym,
+    "called one's own environment": (
+        replaced(PENDULUM, "MyPendulum-v0"),
+        "cannot be recreated: .* --trust MyPendulum-v0",
+    ),
+    "called gym's": (pretend_to_be_gym, "journal does not name its environment"),
     "a second file in a model's sources": (put_another_model_before, "zip"),
-    "evaluation called training": call_it_trained,
+    "evaluation called training": (call_it_trained, "archive has it: .*000002.h5"),
     # Claims without a lie.
     "another MuJoCo claimed": (CLAIMS["another MuJoCo"], "is claimed to be"),
     "another GPU claimed": (claim_gpu, "is claimed to be"),
@@ -961,13 +1110,31 @@ EDITED = {
             line,
         )
         for what, lie, claim, line in (
-            ("text after a trajectory", add_to_the_end, "Gymnasium", "space outside"),
-            ("a dataset deleted", hide_in_hdf5, "Gymnasium", "space outside"),
-            ("text in a chunk", add_to_a_chunk, "Gymnasium", "space outside"),
+            ("text after a trajectory", add_to_the_end, "HDF5", "space outside"),
+            ("a dataset deleted", hide_in_hdf5, "HDF5", "space outside"),
+            ("text in a chunk", add_to_a_chunk, "HDF5", "space outside"),
             ("a name in a model's file", name_in_gzip, "machine", "gzip header"),
             ("a stream after a model", add_a_gzip_stream, "machine", "gzip stream"),
+            ("an extra field in sources", extra_in_sources, "machine", BESIDE),
+            ("a time in sources", time_in_sources, "machine", BESIDE),
+            ("text after a file in sources", after_sources, "machine", BESIDE),
         )
     },
+    **{
+        f"{what}, with another ffmpeg claimed": (
+            both(each(2, lie), claim_ffmpeg),
+            line,
+        )
+        for what, lie, line in (
+            ("a message of the encoder", say_it_in_the_stream, "messages"),
+            ("text among the frames", in_box(b"mdat"), "more than its frames"),
+            ("text after the parameters of a stream", in_box(*BOXES), "avcC"),
+        )
+    },
+    "spaces in JSON, with another Gymnasium claimed": (
+        both(CLAIMS["another Gymnasium"], write_with_spaces),
+        "not written as mjrec writes",
+    ),
     # Additions.
     "a dataset added": (
         in_hdf5(lambda file: file.create_dataset("success", data=np.ones(3))),
@@ -994,12 +1161,16 @@ EDITED = {
 
 # Of the usual run, when it was packed; the lists of the bag are made to fit.
 PACKED = {
-    "the worst's video called pending": pending_worst,
-    "a video called made smaller": say_it_was_made_smaller,
+    "the worst's video called pending": (pending_worst, "pending: the archive has"),
+    "a video called made smaller": (say_it_was_made_smaller, "packed_smaller: only"),
     "a line about rows": (add_a_line_about_rows, "goals"),
     "a note beside the data": (add_a_file("notes.txt"), "notes.txt"),
     "a note in the data": (add_a_file("data/notes.txt"), "notes.txt"),
     "a note in the recordings": (add_a_file("data/recordings/notes.txt"), "notes.txt"),
+    "words in the date": (
+        replace_in("bag-info.txt", "Bagging-Date: ", "Bagging-Date: all reached "),
+        "bag-info",
+    ),
     "a video of no recording": (add_a_video, "does not belong to a recording"),
     "README claims more": (
         replace_in("README.md", "## Videos", "All reached the goal.\n\n## Videos"),
@@ -1035,25 +1206,30 @@ PACKED = {
 # Recorded of an environment that is not what its name says.
 DOCTORED = {
     "rewards doubled by a wrapper that is not named": (lying.double_reward, "reward"),
-    "falls that do not end an episode": lying.never_fall,
-    "a pole that is held": lying.push,
-    "a heavier robot": lying.make_heavy,
-    "played on the moon": lying.raise_gravity,
-    "every episode a success": lying.always_succeed,
-    "a body made invisible": lying.hide_the_pole,
+    "falls that do not end an episode": (lying.never_fall, "terminated: the archive"),
+    "a pole that is held": (lying.push, r"0\.length: the archive has 5"),
+    "a heavier robot": (lying.make_heavy, r"0\.length: the archive has 4"),
+    "played on the moon": (lying.raise_gravity, r"0\.length: the archive has 4"),
+    "every episode a success": (lying.always_succeed, "success: the archive has True"),
+    "a body made invisible": (lying.hide_the_pole, "model_changes/0/geom_rgba"),
 }
 
 # Of other runs.
 OTHERS = {
+    "a return in the monitor.csv": (with_csv, edit_the_csv, "monitor.csv"),
     "rewards doubled of an episode that was cut off": (
         *(honest.early, double_rewards_cut_off, "reward"),
     ),
     "rewards doubled of an episode whose encoder was killed": (
         *(honest.encoder_killed, partial(double_rewards_of, episode=1), "reward"),
     ),
-    "an end cut off without a fault": (honest.end_lost, leave_faults_out, ""),
+    "an end cut off without a fault": (
+        honest.end_lost,
+        leave_faults_out,
+        r'"length": 200.* run has \{"cut"',
+    ),
     "an end cut off, with a fault of another episode": (
-        *(honest.end_lost, blame_another_episode, ""),
+        *(honest.end_lost, blame_another_episode, r'"length": 200.* run has \{"cut"'),
     ),
     "rewards doubled before a fault": (
         *(honest.end_lost, partial(double_rewards_of, episode=1), "reward"),
@@ -1070,11 +1246,13 @@ OTHERS = {
     "an option that no reset can be given, of a killed recording": (
         *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION), "of a reset"),
     ),
-    "actions called float64": (honest.cheetah, each(3, call_it_double), ""),
-    "the best called the worst": (best, replaced("best:1", "worst:1"), ""),
-    "the worst of an evaluation called its best": (evaluated_and_swapped, None, ""),
-    "arguments hidden": (noiseless, hide_arguments, ""),
-    "another model's sources": (honest.mjcf, swap_the_model, ""),
+    "actions called float64": (honest.cheetah, each(3, call_it_double), r"0\.reward"),
+    "the best called the worst": (best, replaced("best:1", "worst:1"), r"2\.recording"),
+    "the worst of an evaluation called its best": (
+        *(evaluated_and_swapped, None, 'only the archive has it: .*"rule": "best"'),
+    ),
+    "arguments hidden": (noiseless, hide_arguments, r"0\.length"),
+    "another model's sources": (honest.mjcf, swap_the_model, "compiled differently"),
     "a key in the manifest, with a schedule of one's own": (
         *(by_hand, add_to_manifest, "award"),
     ),
@@ -1092,7 +1270,8 @@ BELIEVED = {
         r"differ from the controls.* \[wrappers\]",
     ),
     "cut before the fall, with a wrapper claimed": (
-        *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper), ""),
+        *(honest.pendulum, both(cut_as_by_a_limit, claim_wrapper)),
+        r"end flags of 1 of its steps differ.* \[wrappers\]",
     ),
     "one episode shown as two, with its seed": (
         *(honest.pendulum, show_one_as_two, "same episode"),
@@ -1124,27 +1303,27 @@ BELIEVED = {
 }
 
 # Where nothing need differ, nothing was excused.
-HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg")
-
-
-def rows(table):
-    """Yield what, how, and what is said of it, if that is given."""
-    for what, given in table.items():
-        yield (what, *(given if isinstance(given, tuple) else (given, "")))
+HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg", "another HDF5")
 
 
 FORGERIES = (
-    *(Forgery(what, lie, line) for what, lie, line in rows(EDITED)),
-    *(Forgery(what, bag=bag, line=line) for what, bag, line in rows(PACKED)),
-    *(Forgery(w, of=doctored(change), line=line) for w, change, line in rows(DOCTORED)),
+    *(Forgery(what, line, lie) for what, (lie, line) in EDITED.items()),
+    *(Forgery(what, line, bag=bag) for what, (bag, line) in PACKED.items()),
     *(
-        Forgery(what, lie, line, of=of, verdict=verdict)
+        Forgery(what, line, of=doctored(change))
+        for what, (change, line) in DOCTORED.items()
+    ),
+    *(
+        Forgery(what, line, lie, of=of, verdict=verdict)
         for verdict, forgeries in ((FAIL, OTHERS), (PARTLY, BELIEVED))
         for what, (of, lie, line) in forgeries.items()
     ),
-    *(Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS) for name in HARMLESS),
     *(
-        Forgery(f"rewards doubled, {how}", double_rewards, "reward", packing=packing)
+        Forgery(f"{name} claimed", r"noted .* \[", CLAIMS[name], verdict=PASS)
+        for name in HARMLESS
+    ),
+    *(
+        Forgery(f"rewards doubled, {how}", "reward", double_rewards, packing=packing)
         for how, packing in (
             ("of episodes that were not chosen for packing", {"episodes": [0]}),
             ("anonymously", {"anonymous": True}),
@@ -1152,22 +1331,22 @@ FORGERIES = (
     ),
     Forgery(
         "a claim in the README beside versions, with another MuJoCo claimed",
+        "README",
         CLAIMS["another MuJoCo"],
         bag=replace_in("README.md", "| versions | ", "| versions | best policy, "),
-        line="README",
     ),
     Forgery(
         "a return in the table, beside an environment of one's own",
+        "statistics.csv",
         lambda run: replace_in_second(run, '"id": "InvertedP', '"id": "MyP'),
         of=honest.several,
         bag=edit_the_table,
-        line="statistics.csv",
     ),
     Forgery(
         "an option of packing that tells more",
+        "packing options",
         packing={"anonymous": True},
         bag=tell_in_options,
-        line="packing options",
     ),
 )
 

@@ -83,17 +83,29 @@ def test_shadow_in_either_frame_is_removed():
     shaded[8:16, 8:24] //= 4
     lit, shaded = planes_of(noise()), planes_of(shaded)
     for one, other in ((lit, shaded), (shaded, lit)):
-        unshadowed, share = but_for_shadows(one, other)
+        unshadowed, share, patch = but_for_shadows(one, other)
         assert similarity(one, other).block > 50
         assert similarity(one, unshadowed).block < 20
         # Dark parts cannot get much darker.
         assert 0.02 < share <= 8 * 16 / (48 * 64)
+        assert 0 < patch <= 8 / 48
 
 
 def test_other_colors_are_no_shadows():
     green = np.full((48, 64, 3), (20, 200, 20), np.uint8)
     red = green.copy()
     red[8:16, 8:24] = (90, 10, 10)
-    unshadowed, share = but_for_shadows(planes_of(green), planes_of(red))
-    assert share == 0
+    unshadowed, *shares = but_for_shadows(planes_of(green), planes_of(red))
+    assert shares == [0, 0]
     assert similarity(planes_of(red), unshadowed).block == 0
+
+
+@pytest.mark.parametrize(
+    ("sides", "patch"), [((4, 60), 0), ((8, 8), 8 / 480), ((30, 30), 30 / 480)]
+)
+def test_edges_of_shadows_are_no_patch(sides, patch):
+    """As thin as they are drawn elsewhere, while a square may hide what it covers."""
+    lit = np.full((480, 480, 3), 150, np.uint8)
+    shaded = lit.copy()
+    shaded[200 : 200 + sides[0], 200 : 200 + sides[1]] = 0
+    assert but_for_shadows(planes_of(lit), planes_of(shaded))[2] == patch

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Honest runs of each kind, packed: the verdict, and the excuses that it rests on."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from parts import parametrize
 
 import honest_runs as honest
 import mjrec
+from mjrec.commands import main
 from mjrec.evidence.findings import Verdict
 
 PASS, PARTLY = Verdict.PASS, Verdict.PARTLY
@@ -82,3 +88,52 @@ def test_honest_run_comes_out_again(
     assert found.verdict is verdict, said
     assert {each.name for each in found.excuses} == set(believed), said
     assert ("at a smaller size for packing" in said) == ("max_size" in packing), said
+
+
+@pytest.mark.thorough
+def test_excuse_that_the_reader_accepts_does_not_lower_the_verdict(tmp_path, capsys):
+    """By its value: a wrapper of another name is not accepted."""
+    honest.wrapped_in_code(tmp_path / "run")
+    archive = str(mjrec.pack(tmp_path / "run", tmp_path / "run.zip"))
+    for value, status in (("TransformReward", 0), ("ClipReward", 3)):
+        assert main(["verify", archive, "--allow", f"wrappers={value}"]) == status
+        assert ("allowed" in capsys.readouterr().out) == (status == 0)
+
+
+def packed_elsewhere(record, into, python=sys.executable, **environ):
+    """Record and pack in another process, with other variables."""
+    program = (
+        "import honest_runs, mjrec, pathlib, sys\n"
+        "into = pathlib.Path(sys.argv[1])\n"
+        f"honest_runs.{record.__name__}(into / 'recorded')\n"
+        "mjrec.pack(into / 'recorded', into / 'run.zip')\n"
+    )
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ}
+    subprocess.run([python, "-c", program, str(into)], env=environ, check=True)
+    return into / "run.zip"
+
+
+NARROW = {"LP_NATIVE_VECTOR_WIDTH": "128", "GALLIUM_OVERRIDE_CPU_CAPS": "sse4.1"}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("environ", [{"MUJOCO_GL": "osmesa"}, NARROW])
+def test_run_comes_out_again_with_another_rasterizer(environ, tmp_path):
+    """Its frames may differ a little, and that is claimed."""
+    found = mjrec.verify(packed_elsewhere(honest.large, tmp_path, **environ))
+    said = "\n".join(map(str, [*found.findings, *found.excuses]))
+    assert found.verdict in (PASS, PARTLY), said
+    assert {each.name for each in found.excuses} <= {"gl"}, said
+
+
+@pytest.mark.skipif(
+    "MJREC_TEST_MUJOCO" not in os.environ, reason="needs a Python with another MuJoCo"
+)
+@pytest.mark.parametrize("record", [honest.pendulum, honest.cheetah, honest.mjcf])
+def test_run_comes_out_again_with_another_mujoco(record, tmp_path):
+    """Its steps differ a little, and what was compiled is believed."""
+    archive = packed_elsewhere(record, tmp_path, os.environ["MJREC_TEST_MUJOCO"])
+    found = mjrec.verify(archive)
+    said = "\n".join(map(str, found.findings))
+    assert found.verdict is PARTLY, said
+    assert "mujoco" in {each.name for each in found.excuses}, said

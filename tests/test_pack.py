@@ -4,6 +4,7 @@
 import csv
 import json
 import os
+import re
 import shlex
 import shutil
 import stat
@@ -22,6 +23,7 @@ from recordings import frames_of, manifest_of, metadata_of, videos_in
 
 import honest_runs
 import mjrec
+from mjrec.commands import main
 from mjrec.evidence.layout import STATISTICS_COLUMNS
 from mjrec.formats.journal import is_of_spans
 
@@ -291,6 +293,15 @@ def test_the_readme_leads_a_stranger(infix, recorded, bag):
     ):
         assert part in text
     assert "The author chose" not in text
+
+
+def test_the_readme_leads_to_a_replay(bag, tmp_path, monkeypatch):
+    """Its commands make a page of an episode, in a copy of the recordings."""
+    monkeypatch.chdir(shutil.copytree(bag, tmp_path / "bag"))
+    copy, replay = re.findall(r"(?:    (cp .*)|`mjrec (replay .*?)`)", readme_of(bag))
+    subprocess.run(copy[0].split(), check=True)
+    assert main(replay[1].replace(" N", " 1").split()) == 0
+    assert "episode 1" in Path("replay.html").read_text()
 
 
 def test_the_readme_says_what_environments_were_made_with(tmp_path):

@@ -270,7 +270,7 @@ if __name__ == "__main__":
 
 PACKAGES = (
     *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
-    "imageio-ffmpeg",
+    *("h5py", "imageio-ffmpeg"),
 )
 
 

@@ -31,7 +31,7 @@ _COMPILING: Final = ("mujoco", "machine")
 # A version must be short, and cannot be a sentence.
 VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
 # Only these names claim versions; some excuses have other names.
-_PACKAGES: Final = frozenset(("python", *PACKAGES, "zlib"))
+_PACKAGES: Final = frozenset(("python", *PACKAGES, "hdf5", "zlib"))
 _RECORDING: Final = "recording "
 _METADATA: Final = ".meta.json"
 # For each name, the value to compare and the value to show, which may be the same.

@@ -27,7 +27,6 @@ from .claims import claimed_excuses
 from .compare_descriptions import compare_descriptions
 from .compare_json import Rules, compare_journals, compare_objects, video_of
 from .compare_models import (
-    RECOMPILED,
     compare_models,
     compare_sources,
     model_name,
@@ -36,7 +35,7 @@ from .compare_models import (
 )
 from .compare_rows import compare_trajectories, same_trajectory
 from .compare_video import compare_frame_hashes, compare_sampled, compare_videos
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, only_in, short
 from .excuses import applicable, is_fed, merged, noted_excuse, read_notes, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .honesty import remarks_on_video
@@ -48,7 +47,6 @@ _Found: TypeAlias = Iterator[Same | Difference]
 # Keys of a manifest that rendering changes.
 _DRAWN_KEYS: Final = frozenset(("videos", "pending", "broken"))
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-_NOT_MADE: Final = "this file was not recreated"
 
 
 def _compare_manifests(given: Path, made: Path, rules: Rules) -> _Found:
@@ -178,7 +176,7 @@ class Comparison:
         total, done = sum(given.values()), 0
         for file in sorted(given.keys() | made.keys(), key=_order):
             if file in given and file in made:
-                yield from self._compare_file(file)
+                yield from self._compare_file(file, self._made / file)
             else:
                 yield from self._only_in_one(file, file in given)
             done += given.get(file, 0)
@@ -205,9 +203,12 @@ class Comparison:
         renamed = self._rules.renamed
         if model in renamed or model in renamed.values():
             # The sources are equal, but the name contains the compiled model's hash.
-            if is_given and ending == ".mjb.gz":
-                yield replace(RECOMPILED, file=file)
-            return
+            again = self._made / RECORDINGS / f"{renamed.get(model)}{ending}"
+            if is_given and again.is_file():
+                yield from self._compare_file(file, again)
+                return
+            if not is_given:
+                return
         if not is_given and self._level is not Level.PIXELS and ending == ".h5":
             with open_hdf5(self._made / file) as reader:
                 if reader.facts.get("kept") is False:
@@ -222,9 +223,7 @@ class Comparison:
             file=file,
             # A compiled model missing from the archive is not excused.
             aspect=Aspect.MODEL if ending == ".mjb.gz" and is_given else Aspect.EXACT,
-            how=_NOT_MADE
-            if is_given
-            else "the archive has no such file, but one was recreated",
+            how=only_in(is_given, Path(file).name),
         )
 
     def _is_unplayed(self, model: str) -> bool:
@@ -238,12 +237,14 @@ class Comparison:
         played = (m for i, m in models if f"recording {i}" not in self._unplayed)
         return {model_name(file) for files in played for file in files}
 
-    def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
-        given, made, kind = self._given / file, self._made / file, _kind(file)
+    def _compare_file(
+        self, file: str, made: Path
+    ) -> Iterator[Same | Difference | Finding]:
+        given, kind = self._given / file, _kind(file)
         rules = replace(self._rules, given=given, usual=kind.topic)
         try:
             if filecmp.cmp(given, made, shallow=False):
-                found = self._same(file, rules)
+                found = self._same(given, made, rules)
             else:
                 found = kind.compare(given, made, rules)
             if self._level is Level.STATS and _ending(file) == ".h5":
@@ -258,8 +259,9 @@ class Comparison:
             metadata = metadata_of(video_of(given))
             yield from remarks_on_video(metadata, file)
 
-    def _same(self, file: str, rules: Rules) -> _Found:
-        given, made, kind = self._given / file, self._made / file, _kind(file)
+    def _same(self, given: Path, made: Path, rules: Rules) -> _Found:
+        file = f"{RECORDINGS}/{given.name}"
+        kind = _kind(file)
         if _ending(file) in _COUNTED:
             yield from kind.compare(given, made, rules)
         elif _ending(file) == ".h5":

@@ -39,12 +39,8 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
     there = {path.name: path for path in payload.iterdir() if path.name != RECORDINGS}
     there |= {name: bag / name for name in texts if (bag / name).exists()}
     for name in sorted(there.keys() | texts.keys()):
-        if name not in texts:
-            yield _difference(name, "this file was not recreated")
-        elif name not in there:
-            yield _difference(
-                name, "the archive has no such file, but one was recreated"
-            )
+        if name not in texts or name not in there:
+            yield _difference(name, only_in(name in there, name))
         else:
             yield _compare(name, there[name], texts[name])
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import re
 import zipfile
 import zlib
@@ -23,7 +24,7 @@ from ..formats.monitor_directory import infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
 from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same
 from .findings import Topic
-from .hidden_bytes import LARGEST_MODEL, unpacked_model
+from .hidden_bytes import LARGEST_MODEL, compressed_sources, unpacked_model
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
@@ -79,13 +80,18 @@ def models_of(recordings: Path) -> dict[str, set[str]]:
 
 def compare_sources(given: Path, made: Path, _: object) -> Iterator[Same | Difference]:
     """Yield the difference between two models' sources whose bytes differ."""
-    is_equal = _sources(given) == _sources(made)
-    yield Difference(
-        Topic.IDENTITY,
-        # Only the name of the main file differs.
-        aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        how="its sources differ from those of the recreated model",
-    )
+    if _sources(given) != _sources(made):
+        yield Difference(
+            Topic.IDENTITY, how="its sources differ from those of the recreated model"
+        )
+        return
+    # The contents state the name of the main file, which may differ.
+    files = [compressed_sources(path, made) for path in (given, made)]
+    streams = [
+        sorted(each[name] for name in each if name != _CONTENTS) for each in files
+    ]
+    if streams[0] != streams[1]:
+        yield STORED_DIFFERENTLY
 
 
 def compare_models(given: Path, made: Path, _: object) -> Iterator[Same | Difference]:
@@ -110,7 +116,10 @@ def _sources(path: Path) -> str:
         with open_plain_zip(path) as sources:
             if sum(each.file_size for each in sources.infolist()) > LARGEST_MODEL:
                 raise ValueError("its sources are too large")
-            contents = json_object(sources.read(_CONTENTS))
+            text = sources.read(_CONTENTS)
+            contents = json_object(text)
+            if json.dumps(contents).encode() != text:
+                raise ValueError("its contents are not what mjrec writes")
             main = f"source/{contents.get('main')}"
             digest.update(json_text.dumps({**contents, "main": ""}).encode())
             names = [name for name in sources.namelist() if name != _CONTENTS]

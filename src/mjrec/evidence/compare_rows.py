@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
-from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
-from .compare_json import Rules, json_differences
+from .compare_json import Rules, text_differences
 from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same, differs, unlike
 from .findings import Topic
 from .hidden_bytes import hidden_in_trajectory
@@ -141,9 +140,7 @@ def _compare_attributes(
         if left == right or (key == _CHECKSUM and not name):
             continue
         if key == _FACTS and not name:
-            given = json_object(rules.translated(bytes(a.attrs[key])))
-            made = json_object(bytes(b.attrs[key]))
-            yield from json_differences(given, made, rules)
+            yield from text_differences(bytes(a.attrs[key]), bytes(b.attrs[key]), rules)
         else:
             yield differs(Topic.FILES, f"{where}{key}", left[-1], right[-1])
 

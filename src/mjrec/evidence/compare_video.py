@@ -12,6 +12,7 @@ import functools
 import hashlib
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .compare_json import Rules, lines_of
-from .differences import Aspect, Difference, Same, differs, short
+from .differences import Aspect, Difference, Same, differs
 from .findings import Topic
 from .frame_similarity import (
     OTHER_CPU,
@@ -40,6 +41,14 @@ from .mp4_videos import Box, decoded_video, odd_contents, read_boxes, shown_time
 _ENCODED: Final = frozenset(
     ("mdat", "avcC", "btrt", "stsz", "stsc", "stco", "co64", "stss", "ctts", "elst")
 )
+_MEANINGS: Final = {
+    "mvhd": "how long it is and how fast it plays",
+    "mdhd": "how long it is",
+    "tkhd": "how long it is shown, how large, and how it is turned",
+    "avc1": "the size and the shape of its pixels",
+    "stts": "when its frames are shown",
+    "udta": "its title and other texts",
+}
 # Present only if frames are stored out of order or are not all key frames.
 _OPTIONAL: Final = frozenset(("ctts", "stss"))
 _LONGEST_HASHES: Final = 1 << 28
@@ -81,7 +90,7 @@ def compare_videos(
         how="it was encoded differently",
     )
     frames = [*_compare_frames(given, made, rules)]
-    frames += [_differs(*each) for each in odd_contents(given)]
+    frames += [_differs(*each) for each in odd_contents(given, made)]
     yield from frames
     if not found and not any(each.topic is Topic.VIDEOS for each in frames):
         yield Same(Topic.VIDEOS, unit="video")
@@ -91,13 +100,15 @@ def _compare_boxes(given: Sequence[Box], made: Sequence[Box]) -> Iterator[Differ
     kept = [[b for b in boxes if b.name not in _OPTIONAL] for boxes in (given, made)]
     paths = [[box.path for box in boxes] for boxes in kept]
     if paths[0] != paths[1]:
-        extra = [path for path in paths[0] if path not in paths[1]] or paths[0]
-        missing = [path for path in paths[1] if path not in paths[0]] or paths[1]
-        yield _differs("boxes", short(", ".join(extra)), ", ".join(missing))
+        counts = [Counter(each) for each in paths]
+        more = [one - other for one, other in (counts, counts[::-1])]
+        yield _differs("boxes", *(", ".join(each) or "no other" for each in more))
         return
     for one, other in zip(*kept, strict=True):
         if one.name not in _ENCODED and one.content != other.content:
-            yield _differs(one.path, one.content.hex(), other.content.hex())
+            means = _MEANINGS.get(one.name, "more")
+            how = f"the bytes that say {means} differ"
+            yield Difference(Topic.VIDEOS, unit="video", where=one.path, how=how)
 
 
 def _compare_frames(
@@ -106,7 +117,7 @@ def _compare_frames(
     worst, digest = Worst(), hashlib.sha256()
     with decoded_video(given) as (header, one), decoded_video(made) as (again, other):
         if header != again:
-            yield _differs("the stream", header, again)
+            yield _differs("size, rate and shape of pixels", header, again)
             return
         for number, (a, b) in enumerate(itertools.zip_longest(one, other)):
             if a is None or b is None:
@@ -198,7 +209,8 @@ class Worst:
     """Compares pairs of frames and keeps the largest differences."""
 
     def __init__(self) -> None:
-        self._plain, self._lit, self._shadow = _EQUAL, _EQUAL, 0.0
+        self._plain, self._lit = _EQUAL, _EQUAL
+        self._shadow = self._patch = 0.0
         self._differing, self._worst = 0, 0
         self.strain = 0.0
 
@@ -211,8 +223,9 @@ class Worst:
         found = similarity(one, other)
         lit = found
         if OTHER_CPU.strain(found) > 1:
-            but, share = but_for_shadows(one, other)
+            but, share, patch = but_for_shadows(one, other)
             self._shadow = max(self._shadow, share)
+            self._patch = max(self._patch, patch)
             lit = similarity(one, but)
         self._plain, self._lit = _lower(self._plain, found), _lower(self._lit, lit)
         if (strain := OTHER_ENCODER.strain(found)) > self.strain:
@@ -235,6 +248,7 @@ class Worst:
                 **plain._asdict(),
                 **{f"{name}_lit": value for name, value in lit._asdict().items()},
                 "shadow": self._shadow,
+                "patch": self._patch,
                 "worst_frame": self._worst,
             },
         )

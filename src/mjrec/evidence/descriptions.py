@@ -22,6 +22,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
+
 from .. import json_text
 from ..errors import MissingDependency
 from ..formats.json_fields import facts_in, read_object, unreadable
@@ -122,7 +124,8 @@ def packed_with() -> dict[str, str]:
     return {
         "mjrec": importlib.metadata.version("mjrec"),
         "python": platform.python_version(),
-        # Determines the bytes of compressed files.
+        # These determine the bytes of trajectories and compressed files.
+        "hdf5": h5py.version.hdf5_version,
         "zlib": zlib.ZLIB_RUNTIME_VERSION,
     }
 

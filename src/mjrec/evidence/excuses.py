@@ -369,7 +369,8 @@ def _is_within(found: Difference, limit: float | Limits) -> bool:
     if not isinstance(limit, Limits):
         return math.isinf(limit) or (found.size is not None and found.size <= limit)
     figures = found.figures
-    suffix = "_lit" if 0 < figures["shadow"] <= limit.shadow else ""
+    is_shadow = 0 < figures["shadow"] <= limit.shadow
+    suffix = "_lit" if is_shadow and figures["patch"] <= limit.patch else ""
     names = (f"{name}{suffix}" for name in Similarity._fields)
     return limit.strain(Similarity(*(figures[name] for name in names))) <= 1
 

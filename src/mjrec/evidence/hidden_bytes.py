@@ -21,12 +21,18 @@ from ..formats.regular_files import open_regular
 from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from .differences import STORED_DIFFERENTLY, Difference, differs
 from .findings import Topic
+from .zip_contents import open_plain_zip
 
 # Deflate shrinks data at most to this fraction.
 _MOST_EXPANSION: Final = 1032
 # Before HDF5 2.0, the header of each group holds four times, as this flag says.
 _WITH_TIMES: Final = 0x20
 _TIMES_SIZE: Final = 16
+# These are the same for all files that mjrec writes into a zip file.
+_USUAL: Final = (
+    *("date_time", "compress_type", "extra", "create_system", "create_version"),
+    *("extract_version", "reserved", "volume", "internal_attr", "external_attr"),
+)
 # No real model reaches 1 GiB.
 LARGEST_MODEL: Final = 1 << 30
 
@@ -104,3 +110,38 @@ def unpacked_model(path: Path) -> bytes:
         if not stream.eof or stream.unused_data:
             raise ValueError("it holds more or less than one gzip stream")
     return model
+
+
+def compressed_sources(path: Path, made: Path) -> dict[str, bytes]:
+    """Return the compressed files in the sources of a model, keyed by name.
+
+    Args:
+        path: the zip file of the sources, which may hold nothing else.
+        made: one that mjrec wrote here.
+
+    Raises:
+        UnreadableFile: the zip file is damaged, or holds something else.
+    """
+    found: dict[str, bytes] = {}
+    with (
+        unreadable(path),
+        open_plain_zip(made) as other,
+        open_plain_zip(path) as archive,
+    ):
+        usual, content, end = other.infolist()[0], path.read_bytes(), 0
+        for info in sorted(archive.infolist(), key=lambda info: info.filename):
+            header = info.FileHeader(zip64=False)
+            begin = end + len(header)
+            compressed = content[begin : begin + info.compress_size]
+            stream = zlib.decompressobj(-zlib.MAX_WBITS)
+            size = len(stream.decompress(compressed, LARGEST_MODEL))
+            is_plain = content[end:begin] == header and all(
+                getattr(info, name) == getattr(usual, name) for name in _USUAL
+            )
+            if not is_plain or stream.unused_data or size != info.file_size:
+                raise ValueError(f"{info.filename!r} has more than its content")
+            end = begin + info.compress_size
+            found[info.filename] = compressed
+        if end != archive.start_dir:
+            raise ValueError("it has more than its files")
+    return found

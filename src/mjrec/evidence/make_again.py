@@ -157,11 +157,16 @@ class _Playing:
         """Replay all episodes; if the recording was killed, kill this process too."""
         try:
             self._play_all()
-        except NotRecreated:
+        except (Error, MemoryError):
+            raise
+        except Exception as error:
             # The recording's files are not needed any more.
             with contextlib.suppress(Error):
                 self._monitor.close()
-            raise
+            if isinstance(error, NotRecreated):
+                raise
+            # Environments may raise any error for what does not fit them.
+            raise NotRecreated(f"{error!r:.200}") from error
 
     def _play_all(self) -> None:
         recorder = self._monitor.recorder

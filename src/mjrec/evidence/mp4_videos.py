@@ -57,6 +57,13 @@ _MOST_BESIDE: Final = 1 << 20
 # The message in which x264 lists its settings.
 _MESSAGE: Final = b"\0\0\0\1\x06\x05"
 _BY_X264: Final = bytes.fromhex("dc45e9bde6d948b7962cd820d923eeef")
+# The parts of that message that may differ: versions, a year, and values of settings.
+_VALUES: Final = re.compile(
+    rb"(?<=core )\d{1,4}( r\d{1,5} [0-9a-f]{7})?|(?<=2003-)\d{4}"
+    rb"|(?<==)([\d.:,x-]{1,16}|[a-z]{3,4})(?=[ \0])"
+)
+# What may follow the parameters of a stream: that it is yuv420p.
+_FORMATS: Final = (b"", b"\xfd\xf8\xf8\0")
 _READ_SIZE: Final = 1 << 20
 _LONGEST_HEADER: Final = 1024
 _HEADER: Final = re.compile(rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) [^\n]*")
@@ -175,26 +182,42 @@ def _table(boxes: Sequence[Box], name: str) -> NDArray[np.int64]:
     return np.repeat(runs[:, 1].astype(">u4").view(">i4").astype(np.int64), runs[:, 0])
 
 
-def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
+def odd_contents(path: Path, made: Path) -> Iterator[tuple[str, str, str]]:
     """Yield the unusual contents of a video's stream: color tags and captions.
 
-    x264's own message does not count.
+    x264's own message does not count if it names the same settings as in `made`.
 
     Yields:
         The place, its content, and the expected content.
 
     Raises:
-        EncoderError: the video cannot be read.
+        EncoderError, UnreadableFile: the video cannot be read.
     """
+    with unreadable(path):
+        is_plain = _is_plain(_one(read_boxes(path), "avcC").content)
+    if not is_plain:
+        yield "avcC", "more than the stream's parameters", "these"
     tagged, usual = (
         _stream(path, filters, "-f", "hash", "-hash", "sha256")
         for filters in ("h264_mp4toannexb", f"h264_mp4toannexb,{_TAGS}")
     )
     if tagged != usual:
         yield "color tags", "other tags", "BT.709"
-    beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
-    if beside and not _is_by_x264(beside):
+    beside, own = (
+        _stream(each, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
+        for each in (path, made)
+    )
+    texts = [_VALUES.sub(b"", each.partition(_BY_X264)[2]) for each in (beside, own)]
+    if beside and not (_is_by_x264(beside) and texts[0] == texts[1]):
         yield "the stream", "frames and messages", "frames"
+
+
+def _is_plain(parameters: bytes) -> bool:
+    """Return whether an `avcC` box has one parameter set of each kind, and no more."""
+    size = int.from_bytes(parameters[6:8])
+    rest = parameters[8 + size :]
+    end = 3 + int.from_bytes(rest[1:3])
+    return parameters[5:6] + rest[:1] == b"\xe1\1" and rest[end:] in _FORMATS
 
 
 def _is_by_x264(units: bytes) -> bool:

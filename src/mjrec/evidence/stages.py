@@ -161,14 +161,15 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                     if infix_of(path.name) == recording.infix:
                         path.unlink()
                 name, episodes = recording.name, max(1, len(recording.episodes))
-                excuse, reason = error.excuse, str(error)
+                excuse = error.excuse
                 if excuse is not None:
-                    notes.append(note(name, excuse, reason, count=episodes))
+                    # The reason is said below.
+                    notes.append(note(name, excuse, recording.env_id, count=episodes))
                 lost = Finding(
                     Topic.IDENTITY,
                     name,
                     Outcome.DIFFERENT if excuse is None else Outcome.BELIEVED,
-                    f"it cannot be recreated: {reason}",
+                    f"it cannot be recreated: {error}",
                     excuse=excuse,
                     count=episodes,
                     unit="episode",

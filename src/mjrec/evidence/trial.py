@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
@@ -42,9 +42,9 @@ class Trial:
         self._excuses = excuses
         self._scopes = [frozenset(excuse.items) for excuse in excuses]
         self._used: Counter[int] = Counter()
-        # Keyed by excuse and unit.
-        self._equal: Counter[tuple[int, str]] = Counter()
-        self._other: Counter[tuple[int, str]] = Counter()
+        # Units of each recording, keyed by excuse and unit.
+        self._equal: defaultdict[tuple[int, str], Counter[str]] = defaultdict(Counter)
+        self._other: defaultdict[tuple[int, str], Counter[str]] = defaultdict(Counter)
         # Recordings whose frames differ visibly, keyed by excuse.
         self._visible: dict[int, set[str]] = {}
         self._sums: dict[tuple[Any, ...], Finding] = {}
@@ -63,8 +63,7 @@ class Trial:
         if isinstance(found, Same):
             is_proof = True
             for index in self._reaching(found):
-                for unit in (found.unit, f"{found.unit} of {_recording(found)}"):
-                    self._equal[index, unit] += found.count
+                self._equal[index, found.unit][_recording(found)] += found.count
                 # The item was copied from the archive, so it proves nothing.
                 is_proof &= not is_fed(self._excuses[index].name, found.topic)
             if is_proof:
@@ -93,8 +92,7 @@ class Trial:
             if outcome is None:
                 continue
             recording = _recording(found)
-            for unit in (found.unit, f"{found.unit} of {recording}"):
-                self._other[index, unit] += found.count
+            self._other[index, found.unit][recording] += found.count
             if found.figures.get("block", 0.0) > _VISIBLE:
                 self._visible.setdefault(index, set()).add(recording)
             if outcome is not Outcome.NOTED:
@@ -167,28 +165,38 @@ class Trial:
 
     def _refutation(self, index: int) -> str | None:
         """Return why a claimed difference is refuted; None if it is not."""
-        excuse, equal = self._excuses[index], self._equal
-        videos = equal[index, "encoding"]
-        if excuse.name == "mujoco" and equal[index, "compiled model"]:
+        excuse, encodings = self._excuses[index], (index, "encoding")
+        if excuse.name == "mujoco" and self._equal[index, "compiled model"]:
             return "the compiled model was written by the same version"
-        if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
-            return f"{videos} videos are equal byte for byte and others are not"
+        if (
+            excuse.name == "ffmpeg"
+            and self._equal[encodings]
+            and self._other[encodings]
+        ):
+            return "some videos are equal byte for byte and others are not"
+        recordings: Sequence[str | None] = [None] if excuse.name == "gl" else []
         if excuse.name == "machine" or (excuse.name == "gl" and is_same_family(excuse)):
             # What differs less may be rounding.
-            where = [f" of {name}" for name in sorted(self._visible.get(index, ()))]
-        else:
-            where = [""] if excuse.name == "gl" else []
-        for place in where:
-            frames = equal[index, f"frame{place}"]
+            recordings = sorted(self._visible.get(index, ()))
+        for recording in recordings:
+            frames = _number(self._equal[index, "frame"], recording)
             # Without all frames, there are no hashes.
-            others = self._others(f"frame hash{place}") or self._others(f"frame{place}")
+            others = self._others("frame hash", recording)
+            others = others or self._others("frame", recording)
             if frames and frames >= _MOST_EQUAL_FRAMES * (frames + others):
-                return f"{frames} frames{place} are equal bit for bit"
+                where = "" if recording is None else f" of {recording}"
+                return f"{frames} frames{where} are equal bit for bit"
         return None
 
-    def _others(self, unit: str) -> int:
+    def _others(self, unit: str, recording: str | None) -> int:
         """Return the number of differing units under any excuse."""
-        return sum(self._other[index, unit] for index in range(len(self._excuses)))
+        counts = (self._other[index, unit] for index in range(len(self._excuses)))
+        return sum(_number(each, recording) for each in counts)
+
+
+def _number(counts: Counter[str], recording: str | None) -> int:
+    """Return the number of units of a recording, or of all of them."""
+    return counts.total() if recording is None else counts[recording]
 
 
 def _recording(place: Place) -> str:

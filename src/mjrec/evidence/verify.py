@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import numbers
 import operator
 import os
@@ -28,13 +27,13 @@ from ..errors import (
 from ..formats.json_fields import from_json
 from ..formats.locks import Lock, is_locked
 from ..machine import machine_fingerprint
+from ..provenance import versions
 from ..sandbox import Sandbox
 from .excuses import with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verification
 from .stages import GIVEN, INPUTS, MADE, MODULE
 from .verification_report import write_verification_report
 
-_PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
 # Compiling a model may take 300 s.
 _TIMEOUT_S = 900.0
 _SEEDS = 2**32
@@ -133,7 +132,7 @@ def verify(
             facts={
                 "archive": heard["facts"],
                 **{key: asked[key] for key in ("sample", "seed", "trust", "allow")},
-                "versions": dict(_versions()),
+                "versions": dict(versions()),
                 "machine": dict(machine_fingerprint()),
             },
         )
@@ -245,12 +244,6 @@ def _sample(sample: int | None) -> int | None:
             f"got {sample!r}. Omit it to check all of them."
         )
     return int(sample)
-
-
-def _versions() -> Iterator[tuple[str, str]]:
-    for package in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            yield package, importlib.metadata.version(package)
 
 
 @contextlib.contextmanager

@@ -114,14 +114,14 @@ def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
     if size < _END.size:
         raise ValueError("it is not a zip file")
     file.seek(size - _END.size)
-    mark, disk, first_disk, _, entries, table_size, offset, comment = _END.unpack(
+    mark, disk, first_disk, here, entries, table_size, offset, comment = _END.unpack(
         file.read(_END.size)
     )
     if mark != b"PK\x05\x06":
         raise ValueError(
             "it is not a zip file, or has a comment or extra bytes at its end"
         )
-    if comment or disk or first_disk:
+    if comment or disk or first_disk or here != entries:
         raise ValueError("it has a comment, or is one part of a split archive")
     end = size - _END.size
     if _FULL_16 not in (entries,) and _FULL_32 not in (table_size, offset):
