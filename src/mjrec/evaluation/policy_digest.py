@@ -107,7 +107,7 @@ def _digest(
     Args:
         roots: the objects.
         ignored: see `pickle_digest`.
-        numbers: the mutable objects that have been seen, numbered. It grows.
+        numbers: the mutable objects seen so far, with their numbers; it is extended.
     """
     hashed = hashlib.sha256()
     # A stack instead of recursion, because policies can be nested deeply.

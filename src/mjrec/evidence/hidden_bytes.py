@@ -117,7 +117,8 @@ def compressed_sources(path: Path, made: Path) -> dict[str, bytes]:
 
     Args:
         path: the zip file of the sources, which may hold nothing else.
-        made: one that mjrec wrote here.
+        made: a zip file of sources that mjrec wrote on this machine, as a model of the
+            layout.
 
     Raises:
         UnreadableFile: the zip file is damaged, or holds something else.

@@ -114,7 +114,7 @@ class AsciicastWriter:
             self._part.unlink(missing_ok=True)
 
     def leave(self) -> None:
-        """Close the unfinished file, which another process can finish."""
+        """Close the unfinished file, so that another process can finish it."""
         if self._file is not None:
             self._file.close()
 
