@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor directories that a liar has edited: all that follows from a lie fits.
+"""Edit a monitor directory the way a liar would, keeping everything consistent.
 
-A liar has mjrec too. So statistics follow from the journal, hashes from the files, and
-what one file says of another is true; `mjrec.pack` then computes the rest.
+A liar has mjrec too, so statistics follow from the journal, hashes match the files,
+and files agree with each other; `mjrec.pack` then computes the rest.
 """
 
 import dataclasses
@@ -26,12 +26,12 @@ _OF_METADATA = ("length", "reward", "terminated", "truncated", "seed", "options"
 
 
 class ForgedRun:
-    """Edits of a monitor directory of one monitor."""
+    """Edit a directory that one monitor recorded."""
 
     def __init__(self, directory):
         self.directory = directory
 
-    # What files there are.
+    # Find files.
 
     def the(self, pattern):
         [path] = self.directory.glob(pattern)
@@ -51,17 +51,17 @@ class ForgedRun:
             return content_of(reader)
 
     def frames(self, episode):
-        """Return the frames of an episode, drawn from its trajectory as it is."""
+        """Return an episode's frames, rendered from its current trajectory."""
         return list(mjrec.render(self.trajectory(episode)))
 
     def lines(self):
-        """Return what the journal says."""
+        """Return the parsed lines of the journal."""
         return [json.loads(x) for x in self.the("*.jsonl").read_text().splitlines()]
 
-    # Edits of one file.
+    # Edit one file.
 
     def edit_json(self, pattern, edit=None, **facts):
-        """Change what files of JSON hold."""
+        """Edit the JSON files that match a pattern."""
         for path in self.directory.glob(pattern):
             content = json.loads(path.read_text())
             if edit is not None:
@@ -69,11 +69,11 @@ class ForgedRun:
             path.write_text(json.dumps({**content, **facts}))
 
     def edit_details(self, **facts):
-        """Change what the manifest says beside gym's own keys."""
+        """Change mjrec's part of the manifest."""
         self.edit_json("*.manifest.json", lambda said: said["mjrec"].update(facts))
 
     def edit_journal(self, edit=lambda lines: None):
-        """Change the lines of the journal; statistics follow."""
+        """Edit the lines of the journal and update the statistics to match."""
         lines = self.lines()
         edit(lines)
         text = "".join(f"{json.dumps(line)}\n" for line in lines)
@@ -89,7 +89,7 @@ class ForgedRun:
         )
 
     def rewrite_zip(self, change=lambda content: content, beside=lambda info: None):
-        """Change what the sources of a model hold, or what stands beside that."""
+        """Change the files in a model's source archive or their headers."""
         path = self.the("*.model.*.zip")
         with zipfile.ZipFile(path) as archive:
             members = [(info, archive.read(info)) for info in archive.infolist()]
@@ -99,9 +99,9 @@ class ForgedRun:
                 archive.writestr(info, change(content))
 
     def edit_rows(self, episode, *, facts=(), **arrays):
-        """Write a trajectory anew, with other facts, arrays and dtypes of `PARTS`.
+        """Rewrite a trajectory with other facts, arrays, or dtypes of `PARTS`.
 
-        An array may be a function that changes a copy of the own one in place.
+        An array may be a function that edits a copy of the current array in place.
         """
         path = self.trajectory(episode)
         with open_trajectory(path) as reader:
@@ -128,10 +128,10 @@ class ForgedRun:
             reader.read = read
             write_hdf5(reader, path)
 
-    # Edits of what several files say.
+    # Edit several files consistently.
 
     def say(self, episode, **facts):
-        """Say something of an episode wherever such a thing is said."""
+        """Change facts of an episode in every file that states them."""
 
         def edit(lines):
             [line] = [each for each in lines if each.get("episode_id") == episode]
@@ -143,13 +143,13 @@ class ForgedRun:
         self.edit_json(f"*.video{episode:06d}*.meta.json", **known)
 
     def say_rewards(self, episode, change):
-        """Say other rewards of an episode, and the return that follows."""
+        """Change the rewards of an episode, and the return to match."""
         rewards = np.asarray(change(self.content(episode).rewards.copy()))
         self.edit_rows(episode, rewards=rewards)
         self.say(episode, reward=added_up(rewards))
 
     def say_everywhere(self, edit):
-        """Edit every object of JSON: in the journal, manifest, metadata and facts."""
+        """Edit every JSON object in the journal, manifest, metadata and facts."""
 
         def walk(value):
             if isinstance(value, dict):
@@ -169,7 +169,7 @@ class ForgedRun:
                 write_hdf5(reader, path)
 
     def replace_everywhere(self, old, new, *, key=None):
-        """Replace a value, of one key or of any, in every object of JSON."""
+        """Replace a value in every JSON object, for one key or for all keys."""
 
         def edit(facts):
             for name, value in facts.items():
@@ -178,12 +178,12 @@ class ForgedRun:
 
         self.say_everywhere(edit)
 
-    # Edits of a video.
+    # Edit a video.
 
     def film(self, episode, frames=None, *, encoder_arguments=(), **said):
-        """Put frames, or those of its trajectory, into the video of an episode.
+        """Encode frames, by default those of the trajectory, as an episode's video.
 
-        Hashes and metadata follow; what else is `said` is added to them.
+        The hashes and metadata are updated, and `said` is added to the metadata.
         """
         frames = self.frames(episode) if frames is None else frames
         path, known = (
@@ -203,37 +203,37 @@ class ForgedRun:
         self.rehash(episode, **counts, **sides, **said)
 
     def mux(self, episode, *arguments, inputs=(), metadata="-1"):
-        """Pass a video through ffmpeg, whose frames stay what they are."""
+        """Remux a video with ffmpeg without changing its frames."""
         path = self.video(episode)
         changed = path.with_suffix(".changed.mp4")
         sources = [each for one in (path, *inputs) for each in ("-i", str(one))]
         command = [ffmpeg_executable(), "-v", "error", *sources, *arguments]
-        # As mjrec does, so that nothing else differs.
+        # These are mjrec's own options, so nothing else differs.
         alike = ("-fflags", "+bitexact", "-movflags", "+faststart", "-map_metadata")
         subprocess.run([*command, *alike, metadata, str(changed)], check=True)
         changed.replace(path)
         self.rehash(episode)
 
     def rehash(self, episode, **facts):
-        """Let the metadata of a video say the hashes of the file, and facts."""
+        """Update the hashes in a video's metadata, and add facts."""
         path = self.metadata(episode)
         said = {**json.loads(path.read_text()), **facts}
         size = {side: said[f"padded_{side}"] for side in ("height", "width")}
         found = content_facts(self.video(episode), **size, pixel_format="yuv420p")
-        # How many frames there are was said.
+        # The caller has already given the frame count.
         hashes = {key: found[key] for key in ("file_sha256", "decoded_sha256")}
         path.write_text(json.dumps({**said, **hashes}))
 
-    # Edits of which episodes there are.
+    # Edit the set of episodes.
 
     def remove_video(self, episode):
-        """Remove a video, and what names it but the journal."""
+        """Remove a video and its entry in the manifest."""
         for path in self.directory.glob(f"*.video{episode:06d}.*"):
             path.unlink()
         self.list_no_video(f".video{episode:06d}.")
 
     def list_no_video(self, part):
-        """Remove from the manifest the videos with this in the names of their files."""
+        """Remove from the manifest the videos whose file names contain `part`."""
 
         def edit(said):
             said["videos"] = [pair for pair in said["videos"] if part not in pair[0]]
@@ -241,7 +241,7 @@ class ForgedRun:
         self.edit_json("*.manifest.json", edit)
 
     def remove_episode(self, episode):
-        """Remove an episode as if it had never been."""
+        """Remove all traces of an episode."""
         self.remove_video(episode)
         self.trajectory(episode).unlink(missing_ok=True)
 
@@ -252,7 +252,7 @@ class ForgedRun:
         self._edit_recorded(lambda numbers: [n for n in numbers if n != episode])
 
     def renumber(self, old, new):
-        """Give an episode another number, in all names and texts."""
+        """Give an episode another number in all file names and contents."""
 
         def renamed(text):
             for kind in ("video", "episode"):
@@ -283,7 +283,7 @@ class ForgedRun:
         self.edit_json("*.manifest.json", edit)
 
     def say_numbers(self, following):
-        """Say how many episodes there were."""
+        """Change the number of episodes."""
         self.edit_details(next_episode_id=following)
 
         def edit(lines):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A full disk, for any user and on any machine."""
+"""Simulate a full disk for any user on any machine."""
 
 import resource
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def file_size_limit(size):
-    """Let nobody in this process, and none that it starts, write beyond `size`."""
+    """Stop this process and its children from writing files larger than `size`."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

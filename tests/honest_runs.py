@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor directories of short honest runs, one function for each kind of run."""
+"""Record short honest runs, with one function for each kind of run."""
 
 import contextlib
 import os
@@ -60,24 +60,24 @@ def _monitored(env, directory, **options):
 
 
 def pendulum(directory, episodes=4, *, longest=5, make=(), **options):
-    """Record evaluated episodes that end by a fall or after five steps."""
+    """Record evaluation episodes that end in a fall or after five steps."""
     env = _made(longest=longest, **dict(make))
     play(_monitored(env, directory, **{"uid": "u", **options}), episodes)
 
 
 def cheetah(directory, **options):
-    """Record an environment that never falls, with one seed at the first reset."""
+    """Record an environment that never falls, and seed only the first reset."""
     monitor = _monitored(_made(_CHEETAH, 4), directory, **options)
     play(monitor, 3, seed=lambda episode: None if episode else 7)
 
 
 def large(directory):
-    """Record videos that are most of an archive."""
+    """Record videos that make up most of an archive."""
     play(_monitored(_made(_CHEETAH, 4, height=480, width=640), directory), 2)
 
 
 def suite(directory):
-    """Record a task of dm_control's suite."""
+    """Record a task from the dm_control suite."""
     tasks = pytest.importorskip("dm_control.suite")
     given = {"random": 3, "time_limit": 0.04}
     env = tasks.load("cartpole", "balance", task_kwargs=given)
@@ -91,7 +91,7 @@ def suite(directory):
 
 
 def vector(directory):
-    """Record one of two environments that reset themselves."""
+    """Record a vector of two environments that reset themselves."""
     options = {"vectorization_mode": "sync", "max_episode_steps": 4, **_SMALL}
     monitor = _monitored(gymnasium.make_vec(_POLE, 2, **options), directory)
     monitor.reset(seed=3)
@@ -101,7 +101,7 @@ def vector(directory):
 
 
 def evaluated(directory, **options):
-    """Evaluate episodes in several chunks, whose videos are chosen among all."""
+    """Evaluate in several chunks, and choose videos among all episodes."""
     given = {"policy": "random", "num_seeds": 3, "keep": "best,failures"}
     given |= {"max_steps": 4, "height": 32, "width": 32, "workers": 1, **options}
     mjrec.evaluate([_POLE], directory=directory, episodes=1, **given)
@@ -125,12 +125,12 @@ def _evaluated_until_right(directory, end):
 
 
 def evaluated_in_part(directory):
-    """Evaluate a policy that raises in some episodes."""
+    """Evaluate a policy that sometimes raises."""
     _evaluated_until_right(directory, _raise)
 
 
 def evaluated_to_death(directory):
-    """Evaluate a policy that kills its process in some episodes."""
+    """Evaluate a policy that sometimes kills its process."""
     _evaluated_until_right(directory, _die)
 
 
@@ -148,28 +148,28 @@ def evaluated_again(directory):
 
 
 def extended(directory):
-    """Evaluate one seed, and later one more."""
+    """Evaluate one seed, then resume with a second one."""
     evaluated(directory, num_seeds=1)
     evaluated(directory, num_seeds=2, resume=True)
 
 
 def clips(directory):
-    """Record clips of four steps, which cross episodes."""
+    """Record clips of four steps that span episodes."""
     pendulum(directory, step_trigger=lambda step: step % 6 == 0, video_length=4)
 
 
 def kept(directory, *, rule="worst:1"):
-    """Record the video of one episode, chosen when all had ended."""
+    """Record one video, chosen after all episodes have ended."""
     pendulum(directory, episodes=5, longest=9, keep=rule)
 
 
 def kept_in_training(directory):
-    """Record as `mjrec record --keep` does, which keeps no actions of other videos."""
+    """Record like `mjrec record --keep`, which keeps no actions of other episodes."""
     pendulum(directory, episodes=4, longest=9, keep="best:1", mode="training")
 
 
 def live(directory):
-    """Record frames of `env.render()` itself."""
+    """Record frames from `env.render()`."""
     pendulum(directory, episodes=2, render="live")
 
 
@@ -180,13 +180,13 @@ def several(directory):
 
 
 def resumed(directory):
-    """Record on in a second monitor, where the first one stopped."""
+    """Resume a recording with a second monitor."""
     pendulum(directory, episodes=2)
     pendulum(directory, episodes=2, resume=True)
 
 
 def killed(directory):
-    """Record in a process that is killed in its third episode, and finish that."""
+    """Kill the process during its third episode, then finish its recording."""
     child = os.fork()
     if child == 0:
         monitor = _monitored(_made(), directory, uid="u")
@@ -196,30 +196,30 @@ def killed(directory):
                 monitor.step(_PUSH)
         _die()
     os.waitpid(child, 0)
-    # The worker of the killed process may still be drawing.
+    # A rendering worker may outlive the killed process.
     mjrec.recover(directory, timeout=60)
     mjrec.render_videos(directory)
 
 
 def unseeded(directory):
-    """Record episodes whose beginning nothing leads to."""
+    """Record episodes without a seed."""
     play(_monitored(_made(), directory), 2, seed=lambda _: None)
 
 
 def early(directory):
-    """Record an episode that a reset cut off."""
+    """Record an episode that a reset ends early."""
     play(_monitored(_made(longest=9), directory, allow_early_reset=True), 3, most=2)
 
 
 def wrapped(directory):
-    """Record with wrappers of Gymnasium's own between monitor and environment."""
+    """Record with a Gymnasium wrapper between the monitor and the environment."""
     env = _made(_CHEETAH, 4)
     env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     play(_monitored(env, directory), 2)
 
 
 def wrapped_in_code(directory):
-    """Record with a wrapper that only its author has."""
+    """Record with a wrapper whose code is not available to readers."""
     env = gymnasium.wrappers.TransformReward(_made(_CHEETAH, 4), lambda r: 2 * r)
     play(_monitored(env, directory), 2)
 
@@ -230,7 +230,7 @@ class _Away(Tracker):
 
 
 def tracker_away(directory):
-    """Record on when a tracker has raised."""
+    """Keep recording after a tracker raises."""
     pendulum(directory, episodes=3, trackers=_Away())
 
 
@@ -241,18 +241,18 @@ def _undecided(episode):
 
 
 def schedule_raises(directory):
-    """Record on when a schedule has raised for the second of three episodes."""
+    """Keep recording after the schedule raises for the second of three episodes."""
     pendulum(directory, episodes=3, video_callable=_undecided, on_error="warn")
 
 
 def trigger_raises(directory):
-    """Record on when the trigger of clips has raised."""
+    """Keep recording after the clip trigger raises."""
     clips = {"step_trigger": _undecided, "video_length": 3}
     pendulum(directory, episodes=2, on_error="warn", **clips)
 
 
 def encoder_killed(directory):
-    """Record on when the encoder of a live video was killed in the second episode."""
+    """Keep recording after the live encoder is killed in the second episode."""
     with _monitored(_made(), directory, render="live", on_error="warn") as monitor:
         for episode in range(2):
             monitor.reset(seed=episode)
@@ -263,7 +263,7 @@ def encoder_killed(directory):
 
 
 def frame_missing(directory):
-    """Record on when `render` has raised in the second episode of a live recording."""
+    """Keep recording after `render` raises in the second episode of a live video."""
     env = _made()
     draw, drawn = env.unwrapped.render, iter([*range(5), None])
 
@@ -277,9 +277,9 @@ def frame_missing(directory):
 
 
 def _on_a_full_disk(directory, longest, full, **options):
-    """Record three episodes. In the second one, the disk is full at these steps.
+    """Record three episodes with the disk full at these steps of the second one.
 
-    Its reset is step -1.
+    Step -1 is the reset.
     """
     env, generator = _made(_CHEETAH, longest), np.random.default_rng(5)
     with _monitored(env, directory, on_error="warn", **options) as monitor:
@@ -287,7 +287,7 @@ def _on_a_full_disk(directory, longest, full, **options):
             with contextlib.ExitStack() as limits:
                 for step in range(-1, longest):
                     if (episode, step) == (1, full.start):
-                        # A thread stores it, and this is not about that.
+                        # A thread stores the model, which this test must not disturb.
                         wait_until(lambda: list(directory.glob("*.mjb.gz")))
                         limits.enter_context(file_size_limit(200))
                     if (episode, step) == (1, full.stop):
@@ -299,22 +299,22 @@ def _on_a_full_disk(directory, longest, full, **options):
 
 
 def trajectory_lost(directory):
-    """Record on when the disk was full during the second of three episodes."""
+    """Keep recording while the disk is full for the whole second episode."""
     _on_a_full_disk(directory, 4, range(-1, 4))
 
 
 def end_lost(directory):
-    """Record on when no rows could be written from the middle of an episode on."""
+    """Record an episode that loses its rows from the middle on."""
     _on_a_full_disk(directory, 200, range(2, 198), max_fps=1)
 
 
 def end_written_late(directory):
-    """Record on when the disk was full at the last step of an episode."""
+    """Keep recording after the disk is full at the last step of an episode."""
     _on_a_full_disk(directory, 4, range(3, 4))
 
 
 def text(directory):
-    """Record an environment that draws with letters."""
+    """Record an environment that renders text."""
     env = gymnasium.make("Taxi-v4", render_mode="ansi", max_episode_steps=3)
     with _monitored(env, directory) as monitor:
         for seed in range(2):
@@ -332,17 +332,17 @@ def mjcf(directory):
 
 
 def training(directory):
-    """Record a training run, which keeps the actions of scheduled episodes only."""
+    """Record a training run, which keeps actions only for scheduled episodes."""
     pendulum(directory, episodes=4, mode="training")
 
 
 def doubles(directory):
-    """Record actions in float64."""
+    """Record float64 actions."""
     play(_monitored(_made(_CHEETAH, 4), directory), 2, kind=np.float64)
 
 
 def views(directory):
-    """Record from another camera, at another size and rate, with the observations."""
+    """Record observations, and use another camera, size and rate."""
     options = {"width": 48, "height": 32, "max_fps": 10, "observations": True}
     options["camera"] = [{"azimuth": 70.0, "distance": 3.0}, "track", -1]
     options["video_callable"] = lambda episode: episode == 1

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matrices of which the default run tries a few cases, and `scripts/test --all` all."""
+"""Run a few cases of a matrix by default, and all of them with `scripts/test --all`."""
 
 import pytest
 from _pytest.mark import ParameterSet
 
 
 def parametrize(names, cases, *, default=1, part=pytest.mark.thorough, **options):
-    """Do what `pytest.mark.parametrize` does, and mark what only `--all` runs.
+    """Parametrize a test, and mark the cases that only `--all` runs.
 
-    `default` is how many of the first cases the default run tries, or which; `part` is
-    the marker of the others.
+    `default` is the number of leading cases to run by default, or a list of cases;
+    `part` is the marker for the others.
     """
     cases = list(cases)
     if cases and not isinstance(default, int) and all(c not in default for c in cases):

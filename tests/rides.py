@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small recorded episode that is hard to draw again.
+"""Record a short episode that is hard to rerender.
 
-The camera rides over an infinite plane, which is drawn around the previous frame's
-camera, while terrain, a texture and a color change.
+The camera rides over an infinite plane, which MuJoCo centers on the camera of the
+previous frame, while terrain, a texture and a color change.
 """
 
 from pathlib import Path
@@ -57,13 +57,13 @@ def start(xml=PLAIN):
 
 
 def move(model, data, number):
-    """Move to a frame's position, in uneven steps."""
+    """Move to the position for a frame, in uneven steps."""
     data.qpos[0] = 3.1 * number + 2 * (number % 3)
     mujoco.mj_forward(model, data)
 
 
 def change(model, number):
-    """Change the model before a frame; return the changed fields."""
+    """Change the model before a frame, and return the changed fields."""
     if number == 3:
         model.hfield_data[20:40] = 1
         return ["hfield_data"]
@@ -77,7 +77,7 @@ def change(model, number):
 
 
 def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
-    """Record a ride as a log; return it with its frames."""
+    """Record a ride as a log, and return the log and its frames."""
     model, data = start()
     option = mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
@@ -107,7 +107,7 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
         for number in range(count):
             names = change(model, number)
             move(model, data, number)
-            # Each frame shows two steps.
+            # Each frame covers two steps.
             for step in sorted({max(2 * number - 1, 0), 2 * number}):
                 add_row(span, step)
             if names:

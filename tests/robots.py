@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium-Robotics environments that run with the installed mujoco."""
+"""List Gymnasium-Robotics environments that work with the installed mujoco."""
 
 import contextlib
 import importlib.util
@@ -14,7 +14,7 @@ has_robotics = importlib.util.find_spec("gymnasium_robotics") is not None
 
 
 def robotics_ids():
-    """Return the ids without mujoco_py; none without the package."""
+    """Return the ids that do not need mujoco_py, or none without the package."""
     if not has_robotics:
         return []
     _register()
@@ -24,7 +24,7 @@ def robotics_ids():
         if str(spec.entry_point).startswith("gymnasium_robotics")
         and "MujocoPy" not in str(spec.entry_point)
         and ".envs.mujoco." not in str(spec.entry_point)
-        # Only rewards differ.
+        # These environments differ only in their rewards.
         and "Dense" not in env_id
     )
 
@@ -33,7 +33,7 @@ def robotics_ids():
 def robots_that_reset():
     """Patch Gymnasium-Robotics so that Fetch, the hand and the kitchen can reset.
 
-    Since mujoco 3.12 `mjtJoint.mjJNT_FREE == np.int32(0)` is False.
+    Since mujoco 3.12 the comparison `mjtJoint.mjJNT_FREE == np.int32(0)` is False.
     """
     if not has_robotics:
         yield
@@ -46,7 +46,7 @@ def robots_that_reset():
         mock.patch(where, types.SimpleNamespace(**patched)),
         warnings.catch_warnings(),
     ):
-        # They warn about other versions and their own observations.
+        # The environments warn about other versions and their own observations.
         warnings.simplefilter("ignore")
         yield
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two packed runs compared: equal, with one edit, and with a claim that allows it."""
+"""Compare two packed runs: equal, with one edit, or with a claim that allows it."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ H100 = "NVIDIA H100 80GB HBM3"
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
-    """A packed run of three episodes, two with a video, unpacked."""
+    """Return the unpacked archive of a run of three episodes, two with a video."""
     directory = tmp_path_factory.mktemp("packed")
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=6, width=48, height=48)
     monitor = mjrec.Monitor(env, directory / "recorded", uid="u", workers=1)
@@ -37,18 +37,18 @@ def packed(tmp_path_factory):
 
 @pytest.fixture
 def given(packed, tmp_path):
-    """A copy to edit."""
+    """Return a copy of the archive to edit."""
     return shutil.copytree(packed, tmp_path / "run")
 
 
 @pytest.fixture
 def made(packed, tmp_path):
-    """A copy that stands for the recreated run, to edit."""
+    """Return a copy to edit that stands for the recreated run."""
     return shutil.copytree(packed, tmp_path / "made")
 
 
 def compared(given, made, *, is_described=False, **options):
-    """Compare; the descriptions of what was edited fit, unless they fit before."""
+    """Compare two runs, after updating descriptions unless `is_described`."""
     if not is_described:
         describe_again(given)
     comparison = Comparison(given, made, **options)
@@ -66,7 +66,7 @@ def counts_of(verification, outcome, topic):
     )
 
 
-# Edits of an unpacked run.
+# These functions edit an unpacked run.
 
 
 def in_json(pattern, edit=lambda content: None, **facts):
@@ -135,7 +135,7 @@ def slower(content):
 
 
 def redrawn(bag, episode, change):
-    """Draw a video's frames otherwise, and let it say so."""
+    """Change the frames of a video, and update its metadata to match."""
     run = ForgedRun(bag / "data/recordings")
     frames = [change(frame.astype(int)) for frame in run.frames(episode)]
     run.film(episode, [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames])
@@ -232,7 +232,7 @@ EDITS = [
 
 
 def test_equal_runs_are_made_again(packed):
-    """Each topic has its count."""
+    """Every topic is reported with its count."""
     verification = compared(packed, packed)
     assert verification.verdict is Verdict.PASS
     counts = {(f.topic, f.unit): f.count for f in verification.findings}
@@ -245,7 +245,7 @@ def test_equal_runs_are_made_again(packed):
 
 @pytest.mark.parametrize(("edit", "topic", "words"), EDITS)
 def test_a_single_edit_is_found(packed, given, edit, topic, words):
-    """It fails, on the line of its topic, and says where."""
+    """The failure appears under the right topic and says where the edit is."""
     edit(given)
     verification = compared(given, packed, is_described=True)
     assert verification.verdict is Verdict.FAIL
@@ -254,7 +254,7 @@ def test_a_single_edit_is_found(packed, given, edit, topic, words):
 
 
 def test_less_deep_levels_compare_less(packed, given):
-    """What they leave out is believed, with counts; rewards are always compared."""
+    """A lower level believes what it skips, and always compares rewards."""
     in_states(3, "qpos", 1e-3)(given)
     shallow = compared(given, packed, level=Level.STATS)
     assert shallow.verdict is Verdict.PARTLY
@@ -276,7 +276,7 @@ def test_less_deep_levels_compare_less(packed, given):
 
 
 def test_some_frames_are_drawn_and_compared(packed, given, made):
-    """Each with its hash and with what the file shows."""
+    """Sampled frames are compared with both the hash file and the video."""
     folder = made / "sampled" / the(given, "*video000000.mp4").name
     folder.mkdir(parents=True)
     for number, frame in enumerate(mjrec.render(the(given, "*episode000000.h5"))):
@@ -289,7 +289,7 @@ def test_some_frames_are_drawn_and_compared(packed, given, made):
     brighter(given)
     failed = compared(given, made, sampled=True).failures
     assert {f.topic for f in failed} == {Topic.PICTURES}
-    # The hashes say what is drawn, the file shows something else.
+    # The hashes match the rerendered frames, but the video file does not.
     hashes = the(given, "*video000000.framehash")
     hashes.write_bytes(the(packed, "*video000000.framehash").read_bytes())
     failed = compared(given, made, sampled=True).failures
@@ -297,7 +297,7 @@ def test_some_frames_are_drawn_and_compared(packed, given, made):
 
 
 def test_an_undrawn_run_has_the_same_videos_to_draw(packed, made):
-    """Below the level of frames a pending video stands for one that is there."""
+    """Without rendering, a pending video in the run matches a video in the archive."""
     pending = [{"episode_id": 0}, {"episode_id": 1}]
     in_json("*.manifest.json", videos=[])(made)
     in_details(lambda said: said.update(pending=pending))(made)
@@ -309,7 +309,7 @@ def test_an_undrawn_run_has_the_same_videos_to_draw(packed, made):
 
 
 def test_what_was_fed_to_the_maker_is_believed(packed, made):
-    """Its episode is not counted as recreated, though it is equal."""
+    """Recorded values that were fed to the run do not count as recreated."""
     fed = note("episode 2 of 0.u", "actions not kept", "its return is believed")
     write_notes(made, [fed])
     verification = compared(packed, made)
@@ -324,7 +324,7 @@ def test_what_was_fed_to_the_maker_is_believed(packed, made):
 
 
 def test_an_excuse_reaches_its_own_item_only(given, made):
-    """A wrapper of one recording excuses successes there, and no files."""
+    """A wrapper claimed for one episode excuses only that episode's success."""
 
     def succeed(episode):
         path = the(given, "*.jsonl")
@@ -346,7 +346,7 @@ def test_an_excuse_reaches_its_own_item_only(given, made):
 
 
 def test_a_claim_of_another_renderer_is_tried(packed, given):
-    """Frames that are alike pass with it, but if some are equal bit for bit."""
+    """Similar frames pass with the claim, unless some are equal bit for bit."""
     redrawn(given, 1, noisy)
     ForgedRun(given / "data/recordings").edit_json("*.meta.json", gl_renderer=H100)
     verification = compared(given, packed)
@@ -363,7 +363,7 @@ def test_a_claim_of_another_renderer_is_tried(packed, given):
 
 
 def test_a_false_claim_of_another_version_is_refuted(packed, given):
-    """The compiled model says which version wrote it."""
+    """The compiled model reveals the version that wrote it."""
     manifest = json.loads(the(given, "*.manifest.json").read_text())
     version = manifest["mjrec"]["versions"]["mujoco"]
     in_text("*.jsonl", f'"mujoco": "{version}"', '"mujoco": "9.0.0"')(given)
@@ -372,7 +372,7 @@ def test_a_false_claim_of_another_version_is_refuted(packed, given):
 
 
 def test_remarks_say_what_a_video_does_not_show(given, made):
-    """They lower no verdict: it was asked for so."""
+    """A note about playback speed does not lower the verdict."""
     for bag in (given, made):
         in_json("*000000.meta.json", playback_speed=2.0)(bag)
     verification = compared(given, made)
@@ -382,7 +382,7 @@ def test_remarks_say_what_a_video_does_not_show(given, made):
 
 
 def test_time_is_linear_in_episodes(tmp_path):
-    """Four times the episodes take about four times as long."""
+    """Four times as many episodes take about four times as long."""
     seconds = []
     for count in (500, 2000):
         bags = [tmp_path / f"{name}-{count}" for name in ("given", "made")]
@@ -398,6 +398,6 @@ def test_time_is_linear_in_episodes(tmp_path):
         start = time.process_time()
         found = list(Comparison(*bags))
         seconds.append(time.process_time() - start)
-        # What was fed to the run has no excuse.
+        # Values that were fed to the run have no excuse.
         assert sum(f.count for f in found if f.outcome is Outcome.DIFFERENT) == count
     assert seconds[1] < 8 * seconds[0] + 0.1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors that record states and leave the frames to other processes."""
+"""Monitors record states and leave the frames to other processes."""
 
 import contextlib
 import copy
@@ -25,7 +25,7 @@ from mjrec.commands import main
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 
 SIZE = {"height": 48, "width": 64}
-# A ball near a floor that feels what touches it, and draws that.
+# This plugin senses contacts between a ball and the floor, and draws them.
 TOUCH_GRID = """
 <mujoco>
   <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
@@ -44,12 +44,12 @@ TOUCH_GRID = """
 
 
 def make(env_id="InvertedPendulum-v5", **arguments):
-    """Return a small environment, without a render mode unless one is given."""
+    """Return a small environment, by default without a render mode."""
     return gymnasium.make(env_id, **SIZE, **arguments)
 
 
 def steps(env, count, *, seed=0):
-    """Reset and take N steps, or fewer if the episode ends."""
+    """Reset, then take N steps or stop when the episode ends."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
     for _ in range(count):
@@ -58,7 +58,7 @@ def steps(env, count, *, seed=0):
 
 
 def monitored(env, directory, *positional, **options):
-    """Return a monitor that takes a reset for the end of an episode."""
+    """Return a monitor that accepts early resets."""
     options = {"workers": 1, "allow_early_reset": True, **options}
     return mjrec.Monitor(env, directory, *positional, **options)
 
@@ -69,13 +69,13 @@ def pending_in(directory):
 
 
 def trajectory_in(directory):
-    """Return the only one."""
+    """Return the only trajectory in a directory."""
     [path] = directory.glob("*.h5")
     return mjrec.load_trajectory(path)
 
 
 def test_close_leaves_a_rendered_directory(tmp_path):
-    """No log, nothing pending, and the video under the attribute that gym had."""
+    """There is no log, nothing is pending, and gym's attribute names the video."""
     with monitored(make(), tmp_path) as env:
         steps(env, 3)
         video = env.video_recorder
@@ -88,14 +88,14 @@ def test_close_leaves_a_rendered_directory(tmp_path):
     assert pending_in(tmp_path) == []
     assert len(manifest_of(tmp_path)["videos"]) == 1
     assert len(frames_in(tmp_path, 0)) == 4
-    # The last episode is no part of the statistics.
+    # An unfinished episode does not count in the statistics.
     metadata = metadata_of(tmp_path, 0)
     assert (metadata["complete"], metadata["reason"]) == (False, "close")
     assert not trajectory_in(tmp_path).complete
 
 
 def test_a_deferred_video_is_the_live_one(tmp_path):
-    """The same bytes, and all that the live one's metadata says."""
+    """The bytes are equal, and all live metadata is in the deferred metadata."""
     found = []
     for how in ("live", "deferred"):
         env = make(render_mode="rgb_array")
@@ -111,7 +111,7 @@ def test_a_deferred_video_is_the_live_one(tmp_path):
     for key in [*same.split(), "decoded_sha256", "file_sha256", "gl_renderer"]:
         assert live[key] == deferred[key], key
     assert deferred["playback_speed"] == 1
-    # Of 25 steps a second every third, and the last.
+    # At 25 steps a second, every third step is shown, and the last one.
     assert (deferred["stride"], deferred["fps"]) == (3, "25/3")
     assert deferred["frame_steps"] == [[0, 3], [4, 4]]
     assert len(frames_in(directory, 0)) == 3
@@ -130,7 +130,7 @@ def test_a_deferred_video_is_the_live_one(tmp_path):
     ],
 )
 def test_trajectories_are_kept_as_asked(options, kept, filmed, tmp_path):
-    """The videos' own are removed once the videos are there, if they are not wanted."""
+    """Unwanted trajectories are removed once their videos are finished."""
     asked = []
     if callable(choose := options.get("trajectory_callable")):
         options = {"trajectory_callable": lambda k: asked.append(k) or choose(k)}
@@ -138,7 +138,7 @@ def test_trajectories_are_kept_as_asked(options, kept, filmed, tmp_path):
         for seed in range(3):
             env.reset()
             steps(env, 1, seed=seed)
-    # Once, though a reset that another one replaces has the same number.
+    # A reset that replaces another has the same number and does not ask again.
     assert asked == ([0, 1, 2] if callable(choose) else [])
     assert sorted(int(path.stem[-6:]) for path in tmp_path.glob("*.h5")) == kept
     assert videos_in(tmp_path) == filmed
@@ -146,7 +146,7 @@ def test_trajectories_are_kept_as_asked(options, kept, filmed, tmp_path):
 
 @pytest.mark.parametrize("way", ["close", "render", "recover"])
 def test_a_monitor_that_never_ends_is_left_alone(way, tmp_path):
-    """Whatever finishes another one's videos or states in the same directory."""
+    """Finishing another monitor's files in the same directory leaves it untouched."""
 
     def own():
         paths = [p for p in tmp_path.iterdir() if f".{living.infix}." in p.name]
@@ -171,7 +171,7 @@ def test_a_monitor_that_never_ends_is_left_alone(way, tmp_path):
 
 
 def test_the_same_workers_draw_one_video_after_another(tmp_path):
-    """They stay until the monitor closes."""
+    """The workers stay until the monitor closes."""
     before, seen = children(), []
     env = make(max_episode_steps=2)
     with monitored(env, tmp_path, lambda _: True, workers=2) as env:
@@ -187,7 +187,7 @@ def test_the_same_workers_draw_one_video_after_another(tmp_path):
 
 @pytest.mark.parametrize("way", ["exception", "wait=False", "collector"])
 def test_leaving_otherwise_renders_nothing(way, tmp_path, caplog):
-    """What is pending is said, and no child is left."""
+    """A message names the pending video, and no child process remains."""
     before = children()
     env = mjrec.Monitor(make(), tmp_path, workers=1)
     if way == "exception":
@@ -219,7 +219,7 @@ env.step([0.0])
 
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
-    """The manifest is written, the line is said, and the process ends at once."""
+    """The manifest is written, a message is logged, and the process ends at once."""
     code = SCRIPT + (
         "import os, signal, threading, time\n"
         "def interrupt():\n"
@@ -233,9 +233,9 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
     assert pending_in(tmp_path) == [0]
 
 
-# Takes more than five seconds: the same video by several numbers of workers.
+# Takes more than five seconds: the same video is rendered with one and three workers.
 def test_changes_of_the_model_show_and_one_worker_draws_the_bytes_of_three(tmp_path):
-    """Colours by themselves, textures after `model_changed`: from the next frame on."""
+    """Colors change by themselves, and textures change after `model_changed`."""
     videos = set()
     for workers in (1, 3):
         directory = tmp_path / str(workers)
@@ -258,7 +258,7 @@ def test_changes_of_the_model_show_and_one_worker_draws_the_bytes_of_three(tmp_p
     assert coloured.max() > 60
 
 
-# What Gymnasium itself has loaded (glfw) is there before.
+# Take the state before recording, because Gymnasium itself has loaded glfw.
 BESIDE = """
 import pathlib, random
 import numpy as np
@@ -273,7 +273,7 @@ before = state()
 
 
 def test_a_script_without_opengl_and_a_main_guard(tmp_path):
-    """It loads no OpenGL, no module is imported twice, and random states are kept."""
+    """OpenGL stays unloaded, the script runs once, and random states are kept."""
     bare, recorded = SCRIPT.split("env = mjrec")
     script = tmp_path / "script.py"
     (tmp_path / "h5py.py").write_text("raise RuntimeError('not this one')")
@@ -292,7 +292,7 @@ def test_a_script_without_opengl_and_a_main_guard(tmp_path):
 
 
 def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corridor):
-    """Dictionaries are one vector, and it is said what that was made from."""
+    """Dictionaries become one vector, and the facts list their parts."""
     kinds = {
         "arm": gymnasium.spaces.Box(-1, 1, (2,)),
         "grip": gymnasium.spaces.Box(-1, 1),
@@ -317,7 +317,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corri
 
 
 def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_path):
-    """Rows follow the data that there is, in the dtypes of the actions given."""
+    """Rows follow the current data and keep the dtypes of the given actions."""
     env = make("HalfCheetah-v5")
     shown = []
     with monitored(env, tmp_path, workers=0) as monitor:
@@ -332,13 +332,13 @@ def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_pat
         inner.mujoco_renderer.data = inner.mujoco_renderer.model = None
         gc.collect()
     trajectory = trajectory_in(tmp_path)
-    # After the time.
+    # The first column of the states is the time.
     np.testing.assert_array_equal(trajectory.states[1:, 1:10], shown)
     assert trajectory.facts["action_dtypes"] == [[0, "float32"], [2, "float64"]]
 
 
 class Overlay(gymnasium.Wrapper):
-    """Draws something on top."""
+    """Draw a white bar over the frame."""
 
     def render(self):
         frame = np.array(self.env.render())
@@ -347,7 +347,7 @@ class Overlay(gymnasium.Wrapper):
 
 
 def test_an_overlay_is_recorded_live_and_says_why(tmp_path, caplog):
-    """Its frames do not follow from the state; to render it again says so, too."""
+    """A message names the wrapper while recording, and again while rerendering."""
     caplog.set_level(logging.INFO)
     with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
         steps(env, 1)
@@ -373,7 +373,7 @@ def test_an_overlay_is_recorded_live_and_says_why(tmp_path, caplog):
 def test_a_plugin_that_draws_is_recorded_live_or_refused(
     how, mode, error, tmp_path, caplog
 ):
-    """Its frames do not follow from what can be put back, and one message says so."""
+    """States cannot reproduce the plugin's drawing, and one message says so."""
     path = tmp_path / "grid.xml"
     path.write_text(TOUCH_GRID)
     env = MjcfEnvironment(path, render_mode=mode, **SIZE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excuses: what each allows, where, and up to which size."""
+"""Check what each excuse allows, where it applies, and up to which size."""
 
 from dataclasses import replace
 
@@ -70,11 +70,11 @@ def reward(aspect, size=None):
         ("major", reward(Aspect.SUMMED, 5e-3), WITHIN),
         ("rk4", difference(Aspect.STATE, 0.2), DIFFERENT),
         ("rk4", difference(Aspect.VELOCITY, 0.5), WITHIN),
-        # A step's reward, which contacts may change, and a return, which adds them up.
+        # Contacts may change a step's reward, and a return adds rewards up.
         ("rk4", reward(Aspect.DERIVED, 0.06), WITHIN),
         ("rk4", reward(Aspect.DERIVED, 0.2), DIFFERENT),
         ("rk4", reward(Aspect.SUMMED, 0.06), DIFFERENT),
-        # A reward of one that is doubled.
+        # This reward of one was doubled.
         ("major", reward(Aspect.DERIVED, 0.5), DIFFERENT),
         ("machine", reward(Aspect.DERIVED, 0.5), DIFFERENT),
         ("gymnasium", reward(Aspect.DERIVED, 0.5), DIFFERENT),
@@ -94,7 +94,7 @@ def reward(aspect, size=None):
         ("llvmpipe", frame(36.0, 12.0), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.001), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.02), DIFFERENT),
-        # A black square of 8x8 pixels, of a frame of 480x480 and of one of 64x64.
+        # These are a black square of 8x8 pixels in frames of 480x480 and 64x64.
         ("llvmpipe", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
         ("machine", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
         ("h100", frame(48.0, 70.0, shadow=0.001, patch=0.017), WITHIN),
@@ -102,7 +102,7 @@ def reward(aspect, size=None):
         ("ffmpeg", frame(36.0, 12.0), WITHIN),
         # Frames are hashed before they are encoded.
         ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), DIFFERENT),
-        # Its rewards were fed to the maker: nothing makes them differ.
+        # The rewards were fed to the recreated run, so nothing can make them differ.
         ("wrappers", reward(Aspect.EXACT), DIFFERENT),
         ("wrappers", reward(Aspect.OBSERVED), BELIEVED),
         ("machine", reward(Aspect.OBSERVED, 1e-6), WITHIN),
@@ -110,14 +110,14 @@ def reward(aspect, size=None):
         ("wrappers", frame(36.0, 12.0), DIFFERENT),
         ("beginning", difference(Aspect.STATE, 1.0, topic=Topic.BEGINNING), DIFFERENT),
         ("environment", difference(Aspect.EXACT), BELIEVED),
-        # Descriptions follow from the recordings, whatever these are of.
+        # Descriptions follow from the recordings, whatever the environment is.
         ("environment", difference(Aspect.EXACT, file="README.md"), DIFFERENT),
         ("beginning", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("of another", difference(Aspect.STATE, 1e-12), DIFFERENT),
     ],
 )
 def test_an_excuse_allows_what_it_states(name, found, outcome):
-    """In its own items, up to its tolerance, and nothing else."""
+    """Nothing outside its own items or beyond its tolerance is allowed."""
     assert Trial([excuse_of(*EXCUSES[name])]).judge(found).outcome is outcome
 
 
@@ -125,7 +125,7 @@ def test_an_excuse_allows_what_it_states(name, found, outcome):
     ("name", "side"), [("llvmpipe", 8), ("machine", 8), ("h100", 28)]
 )
 def test_a_black_square_is_no_shadow(name, side):
-    """In the middle of a body, in a frame of which it is less than half a percent."""
+    """A black square on a body is not excused, even if it is tiny in the frame."""
     lit = np.full((480, 480, 3), 150, np.uint8)
     painted = lit.copy()
     painted[200 : 200 + side, 200 : 200 + side] = 0
@@ -137,7 +137,7 @@ def test_a_black_square_is_no_shadow(name, side):
 
 
 def test_the_widest_excuse_decides():
-    """Each is asked, whatever the order; those that nothing needed are told apart."""
+    """Order does not matter, and excuses that were not needed are marked."""
     trial = Trial([excuse_of(*EXCUSES[n]) for n in ("numpy", "python", "mujoco")])
     trial.judge(difference(Aspect.CLAIM, claim="python"))
     assert [each.is_needed for each in trial.excuses] == [False] * 3
@@ -146,14 +146,14 @@ def test_the_widest_excuse_decides():
 
 
 def test_turns_by_rk4_differ_between_major_versions_only():
-    """Where both are MuJoCo 3, a model that integrates so excuses nothing."""
+    """If both versions are MuJoCo 3, a model that uses RK4 excuses nothing."""
     note = excuse_of("rk4", "quaternions", "", RECORDING)
     for name, kept in (("major", True), ("mujoco", False), ("numpy", False)):
         assert (note in applicable([note, excuse_of(*EXCUSES[name])])) is kept
 
 
 def test_the_same_claim_of_two_recordings_is_one_excuse():
-    """And one of the whole archive takes in all."""
+    """An excuse for the whole archive includes those of its recordings."""
     excuses = [excuse_of("numpy", "1", "2", item) for item in ("a", "b", "a")]
     assert [each.items for each in merged(excuses)] == [("a", "b")]
     assert [e.items for e in merged([*excuses, excuse_of("numpy", "1", "2")])] == [()]
@@ -169,13 +169,13 @@ def test_the_same_claim_of_two_recordings_is_one_excuse():
     ],
 )
 def test_a_reader_takes_an_excuse_with_its_value(allow, allowed):
-    """For CI, which knows where its archives come from."""
+    """A reader who knows where an archive comes from may allow an excuse."""
     [taken] = with_allowed([excuse_of(*EXCUSES["h100"])], [allow])
     assert taken.allowed is allowed
 
 
 @pytest.mark.parametrize("allow", ["gl", "gl=", "=H100", ""])
 def test_no_excuse_is_taken_without_a_value(allow):
-    """Whatever came with it would be taken."""
+    """Without a value, an allowed excuse would accept any claim."""
     with pytest.raises(InvalidArgument, match="gl=NVIDIA H100"):
         with_allowed([], [allow])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording that fails: the simulation stops, or goes on, as the user wants."""
+"""When recording fails, the simulation stops or continues, as the user chose."""
 
 import contextlib
 import os
@@ -28,13 +28,13 @@ both_ways = pytest.mark.parametrize("on_error", ["raise", "warn"])
 
 @pytest.fixture
 def out(tmp_path):
-    """Where the pendulums are recorded."""
+    """Return the directory for recordings."""
     return tmp_path / "run"
 
 
 @pytest.fixture
 def pendulum(out):
-    """Make monitored pendulums that stay up for eight steps."""
+    """Return a function that makes monitored pendulums that stay up for eight steps."""
 
     def make(schedule=lambda _: True, **options):
         size = {"height": 32, "width": 48, "max_episode_steps": 8}
@@ -45,19 +45,19 @@ def pendulum(out):
 
 
 def run(monitor, steps=8):
-    """Take the first steps of an episode."""
+    """Reset, then take some steps."""
     monitor.reset(seed=0)
     go_on(monitor, steps)
 
 
 def go_on(monitor, steps):
-    """Take some more."""
+    """Take more steps without a reset."""
     for _ in range(steps):
         monitor.step(monitor.action_space.sample() * 0)
 
 
 def raised(on_error, kind, match):
-    """Expect an error where it is to be raised, and none where it is a warning."""
+    """Expect an error with `on_error="raise"`, and none with "warn"."""
     if on_error == "raise":
         return pytest.raises(kind, match=match)
     return contextlib.nullcontext()
@@ -73,7 +73,7 @@ def faults_of(directory):
 
 
 def test_a_schedule_that_raises_breaks_no_finished_video(pendulum, out):
-    """The episode before is over, and its video was whole."""
+    """The previous episode has ended, and its video stays whole."""
 
     def schedule(episode):
         if episode == 1:
@@ -90,7 +90,7 @@ def test_a_schedule_that_raises_breaks_no_finished_video(pendulum, out):
 
 
 def test_a_trigger_that_raises_stops_no_simulation(pendulum, out):
-    """It is asked again at the next step."""
+    """The trigger is asked again at the next step."""
 
     def trigger(steps):
         if steps == 2:
@@ -105,7 +105,7 @@ def test_a_trigger_that_raises_stops_no_simulation(pendulum, out):
 
 
 def test_a_dead_encoder(pendulum, out, kill_ffmpeg, caplog):
-    """One error, or one warning; statistics are there, and the next video is whole."""
+    """There is one error or one warning, and the next video is whole."""
     monitor = pendulum(render="live")
     run(monitor, 4)
     assert kill_ffmpeg() == 1
@@ -131,7 +131,7 @@ def test_a_dead_encoder(pendulum, out, kill_ffmpeg, caplog):
 def test_an_environment_that_cannot_be_drawn_any_more(
     on_error, pendulum, out, monkeypatch
 ):
-    """The video ends; after an error a reset is the way on."""
+    """The video ends, and a reset continues after the error."""
     monitor = pendulum(render="live", on_error=on_error)
     run(monitor, 4)
     why = "the window is gone"
@@ -151,7 +151,7 @@ def test_an_environment_that_cannot_be_drawn_any_more(
 
 @both_ways
 def test_videos_that_cannot_be_rendered(on_error, pendulum, out, monkeypatch, caplog):
-    """They stay pending, and the trajectories are there."""
+    """The videos stay pending, and the trajectories exist."""
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     monitor = pendulum(workers=1, on_error=on_error)
     run(monitor)
@@ -168,10 +168,10 @@ def test_videos_that_cannot_be_rendered(on_error, pendulum, out, monkeypatch, ca
 
 @both_ways
 def test_a_full_disk_while_an_episode_is_recorded(on_error, pendulum, out):
-    """Its trajectory ends there; what was recorded before is whole."""
+    """The trajectory ends there, and earlier recordings stay whole."""
     monitor = pendulum(workers=0, on_error=on_error)
     run(monitor)
-    # A thread stores it, and this is not about that.
+    # A thread stores the model, which this test must not disturb.
     wait_until(lambda: list(out.glob("*.mjb.gz")))
     with file_size_limit(200), raised(on_error, FileNotWritten, "Cannot write"):
         run(monitor)
@@ -181,7 +181,7 @@ def test_a_full_disk_while_an_episode_is_recorded(on_error, pendulum, out):
     monitor.close()
     assert stats_of(out)["episode_lengths"] == [8, 8, 8]
     assert (1, "trajectory") in faults_of(out)
-    # Of that without a row nothing is left, though there was room when it ended.
+    # An episode without rows leaves no file, even with room when it ended.
     assert not list(out.glob("*episode000001*"))
     pending = manifest_of(out)["mjrec"]["pending"]
     assert [each["episode_id"] for each in pending] == [0, 2]
@@ -191,7 +191,7 @@ def test_a_full_disk_while_an_episode_is_recorded(on_error, pendulum, out):
 
 @both_ways
 def test_a_full_disk_at_the_journal(on_error, pendulum, out):
-    """What it lacks is written as soon as there is room again."""
+    """Missing lines are written as soon as there is room again."""
     monitor = pendulum(render="off", trajectory_callable=False, on_error=on_error)
     run(monitor)
     [journal] = out.glob("*.jsonl")
@@ -208,7 +208,7 @@ def test_a_full_disk_at_the_journal(on_error, pendulum, out):
 @both_ways
 @pytest.mark.parametrize("what", ["note", "metadata"])
 def test_a_full_disk_at_a_live_video(what, on_error, make_corridor, out):
-    """Closed with room again, the run has its metadata, and nothing is left to do."""
+    """After closing with room again, metadata is complete and nothing is left to do."""
     options = {"on_error": on_error, "name_prefix": "rl-video"}
     monitor = Monitor(make_corridor(4), out, lambda _: True, **options)
     run(monitor, 4)
@@ -237,15 +237,15 @@ def test_a_full_disk_at_a_live_video(what, on_error, make_corridor, out):
 
 @both_ways
 def test_a_full_disk_is_named_though_the_process_ends(on_error, out):
-    """Of a counted episode, whose end found no room."""
+    """The recovered trajectory of a completed episode names the full disk."""
     child = os.fork()
     if child == 0:
         env = gymnasium.make("HalfCheetah-v5", max_episode_steps=300)
         monitor = Monitor(env, out, mode="evaluation", workers=0, on_error=on_error)
-        # The first step makes the log.
+        # The first step creates the log.
         run(monitor, 1)
         full = FileNotWritten(out, "full")
-        # There is room for lines of the journal, and not for rows.
+        # There is room for journal lines, but not for rows.
         with (
             file_size_limit(100_000),
             mock.patch.object(SpanWriter, "end", side_effect=full),
@@ -265,7 +265,7 @@ def test_a_full_disk_is_named_though_the_process_ends(on_error, out):
 
 
 def test_a_disk_without_any_room(pendulum, out):
-    """Nothing is pending of which nothing was written; results come later, and stay."""
+    """Nothing stays pending, and results are written once there is room."""
     monitor = pendulum(workers=0, on_error="warn")
     with file_size_limit(0):
         run(monitor)
@@ -288,7 +288,7 @@ def test_a_disk_without_any_room(pendulum, out):
     ("render", "on_error"), [("live", "warn"), ("deferred", "warn"), (None, "raise")]
 )
 def test_a_directory_that_is_removed_during_the_run(render, on_error, pendulum, out):
-    """An error names what cannot be written, or the simulation goes on to its end."""
+    """An error names the file that cannot be written, or the simulation continues."""
     monitor = pendulum(render=render, workers=0, on_error=on_error)
     run(monitor)
     # A thread may be writing a model there.

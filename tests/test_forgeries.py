@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forged runs: what a liar did, the verdict, and what is said of it.
+"""Forged runs fail verification, or are believed, with a line that names the lie.
 
-Each is made by an author who computes everything else again: returns, statistics,
-hashes of files and frames, metadata, the table, the crate and the bag.
+The forger recomputes everything else: returns, statistics, hashes of files and
+frames, metadata, the table, the crate and the bag.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ PENDULUM = "InvertedPendulum-v5"
 TURNED = "display_orientation=insert:rotate=180"
 DEVICE = {"index": 0, "note": "all succeeded"}
 X264 = "dc45e9bde6d948b7962cd820d923eeef"
-# Where the parameters of a stream are.
+# This path of boxes leads to the parameters of a stream.
 BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1", b"avcC")
 SINE = ("-f", "lavfi", "-i", "sine=duration=0.1")
 TITLE = ("-metadata", "title=Success rate 100 %")
@@ -51,16 +51,16 @@ TITLE = ("-metadata", "title=Success rate 100 %")
 
 @dataclasses.dataclass(frozen=True)
 class Forgery:
-    """A row of the table."""
+    """Describe one forgery and its expected verdict."""
 
     what: str
-    # What is said of it, a regular expression.
+    # This regular expression must match the report.
     line: str
-    # Edits a monitor directory before it is packed.
+    # This function edits a monitor directory before packing.
     lie: Callable | None = None
-    # Records the run that is edited.
+    # This function records the run to edit.
     of: Callable = honest.pendulum
-    # Edits the packed run, whose lists are made to fit afterwards.
+    # This function edits the packed run, whose manifests are then updated.
     bag: Callable | None = None
     verdict: Verdict = FAIL
     packing: dict = dataclasses.field(default_factory=dict)
@@ -75,11 +75,11 @@ def both(*lies):
 
 
 def each(count, lie):
-    """Lie of so many episodes."""
+    """Apply a lie to each of the first `count` episodes."""
     return both(*(partial(lie, episode=episode) for episode in range(count)))
 
 
-# Lies about numbers.
+# These functions lie about numbers.
 
 
 def double_rewards_of(run, episode):
@@ -93,7 +93,7 @@ call_it_successful = each(4, lambda run, episode: run.say(episode, success=True)
 
 
 def leave_states_out(run, episode):
-    """As `pack --episodes` does, but for what that would say in the manifest."""
+    """Remove states like `pack --episodes`, without saying so in the manifest."""
     facts = {"states_left_out": True, "video": None, "model": None}
     left_out = {"state": None, "snapshot": None, "snapshots": np.empty(0)}
     run.edit_rows(episode, frame_steps=np.empty(0, np.int64), facts=facts, **left_out)
@@ -109,12 +109,12 @@ def call_actions_irregular(run, episode):
 
 
 def repeat_last_states(run):
-    """And call those that were there unknown."""
+    """Mark the last states as unknown."""
     run.edit_rows(1, states=lambda states: states[-2:].fill(np.nan))
 
 
 def cut(run, **facts):
-    """Leave out the end of an episode, and of its video."""
+    """Remove the end of an episode and of its video."""
     steps, whole = 2, run.content(1)
     is_truncated = facts.get("truncated", False)
     run.edit_rows(
@@ -137,7 +137,7 @@ cut_as_by_a_limit = partial(cut, truncated=True)
 
 
 def edit_a_state(run):
-    """By one unit in the last place."""
+    """Change one state by one unit in the last place."""
 
     def edit(states):
         states[2, 2] = np.nextafter(states[2, 2], np.inf)
@@ -150,14 +150,14 @@ def edit_an_action(run):
 
 
 def forget_the_seed(run):
-    """Of an episode whose beginning was chosen by hand."""
+    """Drop the seed of an episode whose initial state was chosen by hand."""
     run.say(1, seed=None)
     run.edit_rows(1, facts={"random_state": None})
     edit_a_state(run)
 
 
 def swap_episodes(run):
-    """Tell two episodes in the other order, each with its own seed and video."""
+    """Report two episodes in reverse order, each with its own seed and video."""
     for old, new in ((0, 9), (1, 0), (9, 1)):
         run.renumber(old, new)
 
@@ -171,7 +171,7 @@ def swap_episodes(run):
 
 
 def show_one_as_two(run, **facts):
-    """The best episode's rows and numbers again."""
+    """Report the rows and numbers of the best episode twice."""
     others = run.content(3).facts
     own = ("episode_id", "start_time", "end_time", "possible_video")
     shutil.copy(run.trajectory(2), run.trajectory(3))
@@ -182,7 +182,7 @@ def show_one_as_two(run, **facts):
 
 
 def leave_the_worst_out(run):
-    """And number the others on."""
+    """Remove the worst episode and renumber the others."""
     run.remove_episode(0)
     for old in (1, 2, 3):
         run.renumber(old, old - 1)
@@ -190,14 +190,14 @@ def leave_the_worst_out(run):
 
 
 def leave_the_first_out(run):
-    """As if another monitor had recorded before."""
+    """Remove the first episode as if another monitor had recorded it."""
     run.remove_episode(0)
     run.edit_details(first_episode_id=1)
     run.edit_journal(lambda lines: lines[0]["run"].update(first_episode_id=1))
 
 
 def copy_the_recording(run):
-    """One recording shown as two, by two names."""
+    """Show one recording as two with different names."""
     for path in list(run.directory.iterdir()):
         if ".0.u." in path.name:
             shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.v.")))
@@ -205,7 +205,7 @@ def copy_the_recording(run):
 
 
 def replace_in_second(run, old, new):
-    """Replace a text in all that the second recording says."""
+    """Replace a text in every file of the second recording."""
     for path in run.directory.glob("*.0.v.*"):
         if path.suffix in (".json", ".jsonl"):
             path.write_text(path.read_text().replace(old, new))
@@ -217,7 +217,7 @@ def replace_in_second(run, old, new):
 
 
 def of_the_second(*lies):
-    """Lie of one of two recordings only."""
+    """Apply lies to only the second of two recordings."""
 
     def lie(run):
         (second := run.directory.with_name("second")).mkdir()
@@ -234,18 +234,18 @@ def of_the_second(*lies):
 
 
 def double_rewards_cut_off(run):
-    """Of an episode that is in no statistics, and has a video."""
+    """Double the rewards of an incomplete episode that has a video."""
     twice = 2 * float(run.content(0).rewards.sum())
     run.edit_rows(0, rewards=lambda r: r.__imul__(2), facts={"reward": twice})
     run.edit_json("*.video000000.meta.json", reward=twice)
 
 
 def double_the_return(run):
-    """And leave the rewards of the steps as they are."""
+    """Double the return and keep the rewards of the steps."""
     run.say(1, reward=2 * added_up(run.content(1).rewards))
 
 
-# What is no plain value is given to no reset, so that nothing is recreated.
+# No reset is given an option that is not plain, so nothing can be recreated.
 NO_PLAIN_OPTION = {"note": "version 1.0"}
 give_no_plain_option = methodcaller("say", 3, options=NO_PLAIN_OPTION)
 
@@ -259,7 +259,7 @@ def say_a_random_state(run):
 
 
 def name_an_argument(run):
-    """That no version of the environment takes."""
+    """Add an argument that no version of the environment accepts."""
 
     def edit(facts):
         if isinstance(facts.get("environment"), dict):
@@ -269,13 +269,13 @@ def name_an_argument(run):
 
 
 def swap_the_ending(run):
-    """A fall is called a limit of time."""
+    """Present a fall as a time limit."""
     content = run.content(1)
     run.edit_rows(1, terminated=content.truncated, truncated=content.terminated)
     run.say(1, terminated=False, truncated=True)
 
 
-# Lies about videos.
+# These functions lie about videos.
 
 
 def paint(run, episode=1, *, at=slice(None), side=3):
@@ -295,7 +295,7 @@ def negative(run, episode=1, **said):
 
 
 def refilm(change):
-    """Film frames of what `change` makes of those of the second episode."""
+    """Replace the second episode's frames with the result of `change`."""
     return lambda run: run.film(1, change(run.frames(1)))
 
 
@@ -310,7 +310,7 @@ def swap_videos(run):
 
 
 def negative_as_clip(run):
-    """A video of something else, called a clip, whose states nobody keeps."""
+    """Present other frames as a clip, whose states nobody keeps."""
     negative(run)
     old, new = ".video000001.", ".video000001.step000003."
     for path in list(run.directory.glob(f"*{old}*")):
@@ -329,7 +329,7 @@ def negative_as_clip(run):
 
 
 def live_and_doctored(run):
-    """Frames of something else, called drawn by the environment itself."""
+    """Present other frames as rendered live by the environment."""
     negative(run, recording="live", recording_reason="render='live'")
     run.say(1, recording="live")
     run.edit_rows(1, facts={"video": {"recording": "live"}})
@@ -348,7 +348,7 @@ def swift_in_real_time(run):
 
 
 def second_track(run):
-    """A track on top of it, that players show."""
+    """Add a second track that players show instead of the first."""
     other = run.directory.parent / "other.mp4"
     with VideoWriter(other, fps=25) as writer:
         for frame in run.frames(1):
@@ -359,7 +359,7 @@ def second_track(run):
 
 
 def rotation(run):
-    """Players show a robot that lies as one that stands."""
+    """Rotate the video so that a robot that lies seems to stand."""
     content = bytearray(run.video(1).read_bytes())
     matrix = content.index(b"tkhd") + 4 + 4 * 10
     assert content[matrix : matrix + 4] == b"\0\1\0\0"
@@ -376,12 +376,12 @@ def hidden_bytes(run):
 
 
 def encoded_with(arguments):
-    """Encode the same frames again, with what only players go by."""
+    """Encode the same frames with metadata that only affects players."""
     given = {"encoder_arguments": ("-bsf:v", arguments)}
     return each(2, lambda run, episode: run.film(episode, **given))
 
 
-# The same frames: only the file, or its times, are others.
+# The frames are unchanged; only the file or its timing differs.
 OF_FILES = {
     "twice the speed, as the metadata says": (
         methodcaller("film", 1, fps="50", playback_speed=2.0),
@@ -403,7 +403,7 @@ OF_FILES = {
         bitstream("h264_metadata=sample_aspect_ratio=4/1"),
         "avc1: .* shape of its pixels",
     ),
-    # What happens at the right is not shown.
+    # This crop hides what happens at the right edge.
     "a video cropped": (
         bitstream("h264_metadata=crop_right=16"),
         "size.*: the archive has .* W16 H32",
@@ -413,14 +413,14 @@ OF_FILES = {
 
 
 def say_it_in_the_stream(run, episode):
-    """In the message of the encoder, whose id it has."""
+    """Hide text in an encoder message that uses the encoder's own id."""
     text = f"h264_metadata=sei_user_data={X264}+All_goals_were_reached"
     filters = f"filter_units=remove_types=6,{text}"
     run.film(episode, encoder_arguments=("-x264-params", "me=dia", "-bsf:v", filters))
 
 
 def hide_in_box(run, episode, *path):
-    """At the end of a box in the file of a video, where no program looks."""
+    """Hide text at the end of a box in an mp4 file, where no program looks."""
     run.film(episode, encoder_arguments=("-x264-params", "me=dia"))
     content, text = bytearray(run.video(episode).read_bytes()), b"All were reached."
     numbers, at = [], 0
@@ -429,7 +429,7 @@ def hide_in_box(run, episode, *path):
         numbers.append(at - 4)
     end = numbers[-1] + struct.unpack_from(">L", content, numbers[-1])[0]
     if end < len(content):
-        # The frames move.
+        # The frames move, so their offsets must change.
         chunks = content.index(b"stco") + 8
         [count] = struct.unpack_from(">L", content, chunks)
         numbers += range(chunks + 4, chunks + 4 + 4 * count, 4)
@@ -445,7 +445,7 @@ def in_box(*path):
 
 
 def write_with_spaces(run):
-    """Say something in what no reader of JSON sees."""
+    """Add spaces that no JSON reader sees."""
     text = run.metadata(1).read_text()
     run.metadata(1).write_text(text.replace(": ", ":  ", 1))
 
@@ -456,7 +456,7 @@ def edit_the_csv(run):
 
 
 def add_a_close_up(run):
-    """A further video that nothing asked for, from where it looks best."""
+    """Add an unrequested further video from a flattering camera."""
     path = run.video(1)
     for ending in (".mp4", ".meta.json", ".framehash"):
         name = path.name.replace(".mp4", f".close{ending}")
@@ -469,7 +469,7 @@ def add_a_close_up(run):
 
 
 def call_it_broken(run):
-    """The video of an episode that should not be seen."""
+    """Report a video as broken to hide it."""
     name = run.metadata(1).name
     run.video(1).unlink()
     run.the("*000001.framehash").unlink()
@@ -479,13 +479,13 @@ def call_it_broken(run):
 
 
 def blame_the_schedule(run):
-    """For the video and the trajectory of an episode that should not be seen."""
+    """Remove a video and a trajectory, and report a fault of the schedule."""
     run.trajectory(1).unlink()
     blame_a_fault(run, "video")
 
 
 def blame_a_fault(run, what="trajectory"):
-    """For a video that should not be seen."""
+    """Remove a video and report a fault as the reason."""
     run.remove_video(1)
     fault = {"episode_id": 1, "what": what, "reason": "no idea"}
 
@@ -502,7 +502,7 @@ def blame_a_fault(run, what="trajectory"):
 
 
 def blame_another_episode(run):
-    """For the fault that cost a trajectory its end."""
+    """Attribute the fault that cut a trajectory short to another episode."""
 
     def edit(facts):
         if facts.get("what") == "trajectory":
@@ -520,7 +520,7 @@ def leave_faults_out(run):
 
 
 def pending_worst(bag):
-    """The worst episode's video is to be rendered some day."""
+    """Report the worst episode's video as pending."""
     run = ForgedRun(bag / "data/recordings")
     name, trajectory = run.video(0).name, run.trajectory(0).name
     run.remove_video(0)
@@ -531,14 +531,14 @@ def pending_worst(bag):
 
 
 def say_it_was_made_smaller(bag):
-    """Which would excuse blurred frames."""
+    """Claim that packing reduced the video, which would excuse blurred frames."""
     run = ForgedRun(bag / "data/recordings")
     run.edit_json("*000001.meta.json", packed_smaller={"from": [480, 480]})
     describe_again(bag)
 
 
 def scaled_up(frame):
-    """Return a frame as if it had been drawn at half of the size."""
+    """Return a frame that looks as if it had been rendered at half size."""
     return np.kron(frame[::2, ::2], np.ones((2, 2, 1), np.uint8))
 
 
@@ -546,14 +546,14 @@ def draft_called_full(run):
     run.film(1, list(mjrec.render(run.trajectory(1), quality="draft")))
 
 
-# Lies about what was chosen, and about identity.
+# These functions lie about choices and identity.
 
 
 replaced = partial(methodcaller, "replace_everywhere")
 
 
 def choose_by_hand(run):
-    """Another episode than the schedule names has the video."""
+    """Remove a scheduled video and report it as not chosen."""
     run.remove_video(1)
     run.say(1, chosen=False, recording=None)
     run.edit_rows(1, facts={"video": None})
@@ -563,7 +563,7 @@ def choose_by_hand(run):
 
 
 def pretend_to_be_gym(run):
-    """Of gym's own directories hardly anything can be checked."""
+    """Imitate a gym directory, which offers hardly anything to check."""
 
     def edit(said):
         del said["mjrec"]
@@ -576,7 +576,7 @@ def pretend_to_be_gym(run):
 
 
 def put_another_model_before(run):
-    """Two files of one name, of which a reader sees the first or the last."""
+    """Add a second file of the same name, because readers differ in which they take."""
     path = run.the("*.model.*.zip")
     with zipfile.ZipFile(path) as archive:
         members = {info: archive.read(info) for info in archive.infolist()}
@@ -588,14 +588,14 @@ def put_another_model_before(run):
             archive.writestr(info, content)
 
 
-# Sources of a lighter robot.
+# This edit replaces the sources with those of a lighter robot.
 swap_the_model = methodcaller(
     "rewrite_zip", lambda content: content.replace(b'size=".05"', b'size=".04"')
 )
 
 
 def extra_in_sources(run):
-    """A field that holds a time elsewhere."""
+    """Hide text in an extra field that normally holds a time."""
 
     def edit(info):
         info.extra = b"UT" + struct.pack("<H", 9) + b"succeeded"
@@ -604,7 +604,7 @@ def extra_in_sources(run):
 
 
 def time_in_sources(run):
-    """In the header of a file, which programs ignore for the table of contents."""
+    """Hide text in a local file header, which programs ignore."""
     path = run.the("*.model.*.zip")
     content = bytearray(path.read_bytes())
     content[10:14] = b"best"
@@ -612,7 +612,7 @@ def time_in_sources(run):
 
 
 def after_sources(run):
-    """After the compressed data of a file, where programs do not look."""
+    """Hide text after compressed data, where programs do not look."""
     path, text = run.the("*.model.*.zip"), b"All succeeded."
     with zipfile.ZipFile(path) as archive:
         last, table = archive.infolist()[-1], archive.start_dir
@@ -629,22 +629,22 @@ def after_sources(run):
 
 
 def hide_arguments(run):
-    """The environment was made with noise of its reset's own."""
+    """Hide that the environment was made with its own reset noise."""
     run.say_everywhere(lambda facts: facts.pop("reset_noise_scale", None))
 
 
 def call_it_trained(run):
-    """Training episodes of an evaluation, whose actions nobody keeps."""
+    """Report evaluation episodes as training, whose actions nobody keeps."""
     run.replace_everywhere("e", "t", key="type")
     run.edit_journal(lambda lines: lines[0]["run"]["options"].pop("mode", None))
 
 
 def call_it_double(run, episode):
-    """The actions' own dtype is another."""
+    """Report another dtype for the actions."""
     run.edit_rows(episode, facts={"action_dtypes": [[0, "float64"]]})
 
 
-# Additions.
+# These functions add content.
 
 
 def in_hdf5(edit):
@@ -656,7 +656,7 @@ def in_hdf5(edit):
 
 
 def hide_in_hdf5(run):
-    """Leave the bytes of a dataset that is there no more."""
+    """Leave the bytes of a deleted dataset in the file."""
     text = np.frombuffer(b"All goals were reached. " * 20, np.uint8)
     in_hdf5(lambda file: file.create_dataset("note", data=text))(run)
     in_hdf5(lambda file: file.pop("note"))(run)
@@ -675,7 +675,7 @@ add_a_gzip_stream = at_the_end("*.mjb.gz", gzip.compress(b"", mtime=0))
 
 
 def add_to_a_chunk(run):
-    """After the compressed data, where HDF5 does not look."""
+    """Hide text after compressed data, where HDF5 does not look."""
 
     def edit(file):
         rewards = file["rewards"].id
@@ -686,7 +686,7 @@ def add_to_a_chunk(run):
 
 
 def name_in_gzip(run):
-    """Name the file from which a compiled model was packed."""
+    """Store a file name in the gzip header of a compiled model."""
     path = run.the("*.mjb.gz")
     content = gzip.decompress(path.read_bytes())
     with path.open("wb") as file, gzip.GzipFile("succeeds", "wb", 9, file, 0) as model:
@@ -701,7 +701,7 @@ add_to_manifest = methodcaller("edit_details", award="best")
 
 
 def add_to_facts(key):
-    """Add to all objects that stand under a key."""
+    """Add an entry to every object stored under a key."""
 
     def edit(facts):
         if isinstance(facts.get(key), dict):
@@ -711,7 +711,7 @@ def add_to_facts(key):
 
 
 def add_a_video(bag):
-    """Of a recording of which nothing else is there."""
+    """Add a video whose recording does not exist."""
     path = the(bag, "*.video000001.mp4")
     shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.w.")))
     describe_again(bag)
@@ -722,7 +722,7 @@ def add_a_line(run):
 
 
 def add_a_fault(run):
-    """Which would be in the first lines."""
+    """Add a fault, which the report would show first."""
     fault = {"episode_id": None, "what": "result", "reason": "All goals were reached"}
     run.edit_journal(lambda lines: lines.insert(1, {"fault": fault}))
     run.edit_details(faults=[fault])
@@ -738,7 +738,7 @@ def add_to_a_line(run):
 
 
 def add_a_line_about_rows(bag):
-    """Which packing takes out."""
+    """Add a line of a kind that packing removes."""
     path = the(bag, "*.jsonl")
     lines = path.read_text().splitlines()
     rows = json.dumps({"note": {"name": "all goals reached"}})
@@ -750,7 +750,7 @@ def add_a_file(name):
     return lambda bag: (bag / name).write_text("All goals were reached.")
 
 
-# Lies in descriptions.
+# These functions lie in descriptions.
 
 
 def replace_in(name, old, new):
@@ -789,7 +789,7 @@ def edit_the_table(bag):
     path.write_text("\n".join(lines) + "\n")
 
 
-# What may be claimed beside a lie, where nothing of the kind is true.
+# These false claims accompany a lie.
 
 
 def claim_version(package, version):
@@ -852,7 +852,7 @@ CLAIMS = {
 }
 
 
-# What no reader could play, with what is said of it.
+# No reader could recreate a run with these facts; each has its expected line.
 IMPOSSIBLE = {
     "a rate": (partial(say_an_option, max_fps="nan"), "max_fps.*nan"),
     "an exact rate": (partial(say_an_option, max_fps="1/0"), "max_fps.*1/0"),
@@ -866,11 +866,11 @@ OF_NOTHING = ("environment", "1.0")
 BESIDE = "more than its content"
 
 
-# What is recorded, and packed.
+# These functions record runs to pack.
 
 
 def doctored(change, of=honest.pendulum):
-    """Return what records an environment that is not what its name says."""
+    """Return a function that records an environment that differs from its name."""
 
     def record(directory):
         with lying.doctored(change):
@@ -892,7 +892,7 @@ def best(directory):
 
 
 def close_and_go_on(directory):
-    """Close each time when an episode goes wrong."""
+    """Close and resume whenever an episode goes wrong."""
     small = {"render_mode": "rgb_array", "width": 32, "height": 32}
     options = {"uid": "u", "resume": True, "mode": "evaluation", "workers": 1}
     for first in (0, 2):
@@ -905,7 +905,7 @@ def close_and_go_on(directory):
 
 
 def played_again(directory):
-    """Twice two episodes that differ only in a seed or in actions of no effect."""
+    """Record two pairs of episodes that differ only in seeds or clipped actions."""
     options = {"uid": "u", "mode": "evaluation", "workers": 1, "video_callable": False}
     env = gymnasium.make(PENDULUM, max_episode_steps=3, reset_noise_scale=0.0)
     with mjrec.Monitor(env, directory, **options) as monitor:
@@ -920,7 +920,7 @@ def by_hand(directory):
 
 
 def evaluated_and_swapped(directory):
-    """Call the worst episode of an evaluation its best, as `evaluate` writes it."""
+    """Keep the video of an evaluation's worst episode as its best."""
     honest.evaluated(directory, keep="none")
     ended = [*recorded_results(directory)]
     folder, worst = min(ended, key=lambda each: each[1].total_reward or 0.0)
@@ -929,7 +929,7 @@ def evaluated_and_swapped(directory):
     mjrec.render_videos(folder)
 
 
-# The table.
+# These tables list the forgeries.
 
 QUICK = {
     *("rewards doubled", "rewards doubled by a wrapper that is not named"),
@@ -944,7 +944,7 @@ QUICK = {
 
 A_FRAME_MORE = (double_a_frame, "times: the archive has 5 frames")
 
-# Of the usual run, with the verdict FAIL: what the liar did, how, what is said of it.
+# These edits of the usual run must fail; each has its lie and expected line.
 EDITED = {
     "rewards doubled": (double_rewards, "reward"),
     **{
@@ -954,7 +954,7 @@ EDITED = {
             ("states left out", each(4, leave_states_out)),
             ("actions left out of an evaluation", leave_actions_out),
             ("actions called irregular", each(4, call_actions_irregular)),
-            # No package is called so, but an excuse is.
+            # This names an excuse, not a package.
             ("with a version of the environment claimed", claim_version(*OF_NOTHING)),
             ("with an option that no reset can be given", give_no_plain_option),
         )
@@ -998,7 +998,7 @@ EDITED = {
     ),
     "the first left out": (leave_the_first_out, "begins with episode 1"),
     "fall called a limit of time": (swap_the_ending, "terminated|truncated"),
-    # Videos.
+    # These entries are about videos.
     "a spot painted": (one_spot, "frame 2"),
     **{
         f"a spot painted, with {name} claimed": (
@@ -1026,7 +1026,7 @@ EDITED = {
         methodcaller("film", 1, fps="97/4", playback_speed=0.97),
         "fps",
     ),
-    # The frames that nobody touched show that it is the same build.
+    # Frames that were left alone prove that the build is the same.
     "a spot painted, with another build of llvmpipe claimed": (
         both(one_spot, claim_llvmpipe),
         "7 frames of recording 0.u are equal bit for bit",
@@ -1078,7 +1078,7 @@ EDITED = {
             ("a scheduled video left out", choose_by_hand),
         )
     },
-    # What was chosen, and identity.
+    # These entries are about choices and identity.
     "another schedule named": (
         replaced("capped_cubic_video_schedule", "every:2"),
         r"episode 1\.chosen: only the archive",
@@ -1087,7 +1087,7 @@ EDITED = {
         replaced(PENDULUM, "Hopper-v5"),
         "cannot be recreated: .*Action dimension",
     ),
-    # In what people read; it is made by its own id.
+    # The name changes only where people read it, and the real id is kept.
     "another name": (replaced(PENDULUM, "Humanoid-v5", key="env_id"), "its name is"),
     "called one's own environment": (
         replaced(PENDULUM, "MyPendulum-v0"),
@@ -1096,14 +1096,14 @@ EDITED = {
     "called gym's": (pretend_to_be_gym, "journal does not name its environment"),
     "a second file in a model's sources": (put_another_model_before, "zip"),
     "evaluation called training": (call_it_trained, "archive has it: .*000002.h5"),
-    # Claims without a lie.
+    # These entries make a false claim without another lie.
     "another MuJoCo claimed": (CLAIMS["another MuJoCo"], "is claimed to be"),
     "another GPU claimed": (claim_gpu, "is claimed to be"),
     "another MuJoCo claimed, the compiled model left out": (
         both(CLAIMS["another MuJoCo"], lambda run: run.the("*.mjb.gz").unlink()),
         "mjb.gz",
     ),
-    # Bytes that only a search of the file finds, beside a claim without a lie.
+    # Only a search of the file finds these bytes, as the claim excuses the hash.
     **{
         f"{what}, with another {claim} claimed": (
             both(CLAIMS[f"another {claim}"], lie),
@@ -1135,7 +1135,7 @@ EDITED = {
         both(CLAIMS["another Gymnasium"], write_with_spaces),
         "not written as mjrec writes",
     ),
-    # Additions.
+    # These entries add content.
     "a dataset added": (
         in_hdf5(lambda file: file.create_dataset("success", data=np.ones(3))),
         "success",
@@ -1159,7 +1159,7 @@ EDITED = {
     "a key in a line of the journal": (add_to_a_line, "judged"),
 }
 
-# Of the usual run, when it was packed; the lists of the bag are made to fit.
+# These edits change the usual run after packing.
 PACKED = {
     "the worst's video called pending": (pending_worst, "pending: the archive has"),
     "a video called made smaller": (say_it_was_made_smaller, "packed_smaller: only"),
@@ -1203,7 +1203,7 @@ PACKED = {
     ),
 }
 
-# Recorded of an environment that is not what its name says.
+# These environments differ from what their names say.
 DOCTORED = {
     "rewards doubled by a wrapper that is not named": (lying.double_reward, "reward"),
     "falls that do not end an episode": (lying.never_fall, "terminated: the archive"),
@@ -1214,7 +1214,7 @@ DOCTORED = {
     "a body made invisible": (lying.hide_the_pole, "model_changes/0/geom_rgba"),
 }
 
-# Of other runs.
+# These entries edit other runs.
 OTHERS = {
     "a return in the monitor.csv": (with_csv, edit_the_csv, "monitor.csv"),
     "rewards doubled of an episode that was cut off": (
@@ -1258,9 +1258,9 @@ OTHERS = {
     ),
 }
 
-# What is no proof of a lie, with what is said of it.
+# These cases do not prove a lie, so the report says what is believed.
 BELIEVED = {
-    # It could have been there: this is what a wrapper may do.
+    # A wrapper may really have changed this.
     "rewards doubled, with a wrapper claimed": (
         *(honest.pendulum, both(double_rewards, claim_wrapper)),
         r"rewards .* \[wrappers\]",
@@ -1295,14 +1295,14 @@ BELIEVED = {
     "closed whenever an episode goes wrong, and resumed": (
         *(close_and_go_on, None, "continues after them"),
     ),
-    # The returns of such an episode count, and the first lines name it.
+    # The return of such an episode counts, and the first lines name the episode.
     "the encoder killed before the fall": (
         *(honest.encoder_killed, None),
         r"faults while recording.* video of episode 1(.|\n)*\[broken video\]",
     ),
 }
 
-# Where nothing need differ, nothing was excused.
+# Nothing needs to differ under these claims, so nothing is excused.
 HARMLESS = ("another Gymnasium", "another machine", "another ffmpeg", "another HDF5")
 
 
@@ -1353,7 +1353,7 @@ FORGERIES = (
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory):
-    """Return what records once in a session, for tests that change copies."""
+    """Return a function that records each run once per session, for copying."""
     made = {}
 
     def directory(record):
@@ -1366,7 +1366,7 @@ def recorded(tmp_path_factory):
 
 
 def forged(forgery, run, into):
-    """Return a forged archive, or an unpacked one."""
+    """Return a forged archive, packed or unpacked."""
     directory = shutil.copytree(run, into / "recorded")
     if forgery.lie is not None:
         forgery.lie(ForgedRun(directory))
@@ -1380,7 +1380,7 @@ def forged(forgery, run, into):
 
 
 def told(found):
-    """Return all that speaks against an archive, or is believed."""
+    """Return every line of the report except what was recreated."""
     lines = [
         f"{each.outcome} {each.topic} {each.item}: {each.reason} [{each.excuse}]"
         for each in found.findings
@@ -1400,7 +1400,7 @@ def told(found):
     ids=lambda each: each.what,
 )
 def test_forgery_is_seen(forgery, recorded, tmp_path):
-    """With the verdict of the table, and a line that says where."""
+    """The verdict is as expected, and a line says where."""
     found = mjrec.verify(forged(forgery, recorded(forgery.of), tmp_path))
     assert found.verdict is forgery.verdict, told(found)
     assert re.search(forgery.line, told(found)), told(found)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Similarity of frames in the encoder's color planes."""
+"""Compare frames in the color planes of the encoder."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def noise(height=48, width=64):
 
 @pytest.mark.parametrize("size", [(48, 64), (33, 47), (1, 1)])
 def test_planes_equal_ffmpegs_own_conversion(tmp_path, size):
-    """Within one level, compared with lossless video."""
+    """The planes are within one level of a lossless video."""
     frame, path = noise(*size), tmp_path / "lossless.mp4"
     with VideoWriter(path, fps=10, crf=0) as video:
         video.write(frame)
@@ -38,9 +38,9 @@ def test_planes_equal_ffmpegs_own_conversion(tmp_path, size):
 def test_psnr_and_ssim_have_known_values():
     planes = planes_of(noise())
     assert similarity(planes, planes) == (100.0, pytest.approx(1.0), 0.0)
-    # The mirror image has the same histogram.
+    # A mirror image has the same histogram, but low similarity.
     assert similarity(planes, planes_of(noise()[:, ::-1])).ssim < 0.5
-    # One level more everywhere is a mean square error of one.
+    # A difference of one level everywhere is a mean square error of one.
     planes = planes_of(np.full((16, 16, 3), 100, np.uint8))
     more = type(planes)(*(plane + 1 for plane in planes))
     assert similarity(planes, more).psnr == pytest.approx(48.13, abs=0.01)
@@ -50,7 +50,7 @@ def test_psnr_and_ssim_have_known_values():
 
 @pytest.mark.parametrize(("y", "x"), [(0, 0), (20, 20), (22, 30), (47, 63)])
 def test_worst_block_notices_few_pixels_anywhere(y, x):
-    """Also across corners of blocks and at the frame's edge."""
+    """Pixels count across block corners and at the edge of the frame too."""
     frame = np.full((48, 64, 3), 40, np.uint8)
     changed = frame.copy()
     changed[y : y + 4, x : x + 4] = 255
@@ -64,7 +64,7 @@ def test_worst_block_notices_few_pixels_anywhere(y, x):
     [(OTHER_CPU, 2, 20), (OTHER_ENCODER, 2, 40), (OTHER_RENDERER, 4, 70)],
 )
 def test_limits_notice_small_squares_and_patches(limits, side, levels):
-    """A square of half the contrast, or a patch with more levels."""
+    """Limits notice a square of half contrast and a larger patch of fewer levels."""
     exact = planes_of(np.full((64, 64, 3), 60, np.uint8))
 
     def strain(rows, more):
@@ -104,7 +104,7 @@ def test_other_colors_are_no_shadows():
     ("sides", "patch"), [((4, 60), 0), ((8, 8), 8 / 480), ((30, 30), 30 / 480)]
 )
 def test_edges_of_shadows_are_no_patch(sides, patch):
-    """As thin as they are drawn elsewhere, while a square may hide what it covers."""
+    """A thin edge may differ between renderers, but a square may hide something."""
     lit = np.full((480, 480, 3), 150, np.uint8)
     shaded = lit.copy()
     shaded[200 : 200 + sides[0], 200 : 200 + sides[1]] = 0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments and users that a recorder of states must survive, from outside.
+"""Recordings survive difficult environments and users, checked from outside.
 
-Each is recorded as a user would, and what was drawn later is compared with what the
-environment itself draws.
+Each case is recorded as a user would, and the rendered frames are compared with
+those of the environment.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ SIZE = {"height": 32, "width": 48}
 
 
 class Around(gymnasium.Wrapper):
-    """Does something before every step, and changes what it returns."""
+    """Run a function before every step, and another on its result."""
 
     def __init__(self, env, before=lambda *_: None, after=lambda _, result: result):
         super().__init__(env)
@@ -45,7 +45,7 @@ def pendulum(length=5, **more):
 
 
 def play(env, steps, *, seen=None):
-    """Take steps with small actions, and resets where an episode is over."""
+    """Take steps with small actions, and reset after each episode."""
     is_over = True
     for number in range(steps):
         if is_over:
@@ -63,7 +63,7 @@ def _see(env, seen):
 
 
 def hashes(directory):
-    """Return the hashes of all frames of all videos, in the order of their names."""
+    """Return the hashes of all frames, with the videos sorted by name."""
     return [
         h for path in sorted(directory.glob("*.framehash")) for h in hashes_at(path)
     ]
@@ -75,12 +75,12 @@ def trajectories(directory):
 
 
 def paint(number, env):
-    """Change colours, as those do that show touch sensors."""
+    """Change colors, like environments that show touch sensors."""
     env.model.geom_rgba[:, 0] = number % 5 / 4
 
 
 def grow(number, env):
-    """Change what contexts scale shadows by, and what they are created anew for."""
+    """Change fields that affect shadows and fields that require a new context."""
     env.model.stat.extent *= 1.2
     env.model.vis.rgba.fog[:3] = number // 4 / 4
 
@@ -94,7 +94,7 @@ def grow(number, env):
     ],
 )
 def test_a_model_that_changes_at_every_step(tmp_path, env_id, before, workers):
-    """Each frame is that of its step, whichever worker draws it."""
+    """Each frame shows the model at its step, whichever worker renders it."""
     made = {"max_episode_steps": 5, "render_mode": "rgb_array", **SIZE}
     env = Around(gymnasium.make(env_id, **made), before=before)
     seen = []
@@ -107,7 +107,7 @@ def test_a_model_that_changes_at_every_step(tmp_path, env_id, before, workers):
 @pytest.mark.dm_control
 @pytest.mark.parametrize("is_older", [False, True])
 def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
-    """None is current then, or dm_control's, which does not notice; all is drawn."""
+    """Closing it leaves no context current, or dm_control's, which does not notice."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     options = {"video_callable": lambda _: True, "render": "live", **SIZE}
     drawn = []
@@ -125,7 +125,7 @@ def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
 
 
 def test_an_environment_that_moves_things_while_it_draws(tmp_path):
-    """Fetch moves its target in `_render_callback`; the simulation is left alone."""
+    """Fetch moves its target in `_render_callback` without affecting the simulation."""
     pytest.importorskip("gymnasium_robotics")
     made = {"max_episode_steps": 5, "render_mode": "rgb_array", **SIZE}
     options = {"max_fps": 10, "workers": 1}
@@ -140,7 +140,7 @@ def test_an_environment_that_moves_things_while_it_draws(tmp_path):
 
 
 def test_large_observations_and_actions_that_change(tmp_path):
-    """300 KiB for each step; one action is of another shape than those before."""
+    """Steps return 300 KiB observations, and one action has a different shape."""
     env = Around(
         pendulum(9),
         after=lambda number, result: (
@@ -176,7 +176,7 @@ def test_large_observations_and_actions_that_change(tmp_path):
     reason="Gymnasium before 1.1 has one mode only",
 )
 def test_a_state_that_is_reset_away_is_not_shown(tmp_path):
-    """Where an environment resets itself inside its last step, that frame is not."""
+    """If an environment resets inside its last step, the terminal frame is left out."""
     vector = gymnasium.vector.SyncVectorEnv(
         [pendulum], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP
     )
@@ -192,7 +192,7 @@ def test_a_state_that_is_reset_away_is_not_shown(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_fork_in_mid_episode(tmp_path):
-    """The child cannot write into its parent's recording, and ends as usual."""
+    """The child cannot write to its parent's recording and exits normally."""
     with mjrec.Monitor(pendulum(), tmp_path, lambda _: True, workers=0) as env:
         env.reset(seed=0)
         env.step(np.zeros(1, np.float32))
@@ -228,7 +228,7 @@ else:
 
 @pytest.mark.parametrize("ending", ["pass", "sys.exit()", "os._exit(0)"])
 def test_a_forked_child_that_ends_leaves_its_parents_recording_alone(ending, tmp_path):
-    """Also the process that draws; the child has no file of its own."""
+    """The rendering process survives too, and the child has no files of its own."""
     done = run_python(FORK, tmp_path, ending)
     assert "gone" not in done.stderr
     assert len(hashes(tmp_path)) == 6
@@ -242,14 +242,14 @@ def test_a_forked_child_that_ends_leaves_its_parents_recording_alone(ending, tmp
 
 
 def test_a_run_that_another_machine_renders(tmp_path, monkeypatch):
-    """`close(wait=False)` draws and converts nothing; a copy of what it left does."""
+    """`close(wait=False)` renders nothing, and a copy can be rendered elsewhere."""
     seen = []
     env = mjrec.Monitor(pendulum(), tmp_path / "here", lambda _: True, workers=0)
     play(env, 10, seen=seen)
     env.close(wait=False)
     assert not list((tmp_path / "here").glob("*.mp4"))
     shutil.copytree(tmp_path / "here", tmp_path / "there")
-    # Its user has never seen the model.
+    # The other user has not stored this model.
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     assert main(["render", str(tmp_path / "there"), "--workers", "1"]) == 0
     assert hashes(tmp_path / "there") == seen
@@ -274,7 +274,7 @@ for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
 # Takes more than five seconds: a million steps.
 @pytest.mark.thorough
 def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path):
-    """Where it is recorded; the child that writes its file needs a few bytes a step."""
+    """The recorder's memory stays constant; its child uses a few bytes per step."""
     few, many = (
         run_python(MILLION, tmp_path / str(steps), steps, timeout=900).stdout.split()
         for steps in (10_000, 1_000_000)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Honest runs of each kind, packed: the verdict, and the excuses that it rests on."""
+"""Verify honest runs of each kind, with their verdicts and excuses."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ PASS, PARTLY = Verdict.PASS, Verdict.PARTLY
 STATS = {"level": "stats"}
 NO_ACTIONS, BROKEN = {"actions not kept"}, {"broken video"}
 
-# The run, its verdict, the names of the excuses; options of `pack`, and of `verify`.
+# Each entry has a run, its verdict and excuses, and options of `pack` and `verify`.
 QUICK = [
     (honest.pendulum, PASS, (), {}, {}),
     (honest.suite, PASS, (), {}, {}),
@@ -59,7 +59,7 @@ THOROUGH = [
     (honest.views, PARTLY, {"schedule"}, {}, {}),
     (honest.pendulum, PASS, (), {"anonymous": True}, {}),
     (honest.pendulum, PASS, (), {"episodes": [1]}, {}),
-    # Whole, the archive has 121,000 bytes.
+    # The whole archive has 121,000 bytes.
     (honest.large, PASS, (), {"max_size": 110_000}, {}),
     (honest.pendulum, PARTLY, (), {}, {"sample": 2}),
     (honest.pendulum, PARTLY, (), {}, STATS),
@@ -71,7 +71,7 @@ def name_of(record, verdict, believed, packing, verifying):
     return " ".join([record.__name__, *packing, *verifying])
 
 
-# Some take more than five seconds: a run is recorded, packed, recreated and drawn.
+# Some take more than five seconds: a run is recorded, packed, recreated and rendered.
 @parametrize(
     ("record", "verdict", "believed", "packing", "verifying"),
     [pytest.param(*run, id=name_of(*run)) for run in QUICK + THOROUGH],
@@ -80,7 +80,7 @@ def name_of(record, verdict, believed, packing, verifying):
 def test_honest_run_comes_out_again(
     record, verdict, believed, packing, verifying, tmp_path
 ):
-    """Nothing contradicts it, and what is believed has its excuse."""
+    """Nothing contradicts the run, and everything believed has an excuse."""
     record(tmp_path / "recorded")
     archive = mjrec.pack(tmp_path / "recorded", tmp_path / "run.zip", **packing)
     found = mjrec.verify(archive, **verifying)
@@ -92,7 +92,7 @@ def test_honest_run_comes_out_again(
 
 @pytest.mark.thorough
 def test_excuse_that_the_reader_accepts_does_not_lower_the_verdict(tmp_path, capsys):
-    """By its value: a wrapper of another name is not accepted."""
+    """An excuse is accepted by value, so another wrapper name is not."""
     honest.wrapped_in_code(tmp_path / "run")
     archive = str(mjrec.pack(tmp_path / "run", tmp_path / "run.zip"))
     for value, status in (("TransformReward", 0), ("ClipReward", 3)):
@@ -101,7 +101,7 @@ def test_excuse_that_the_reader_accepts_does_not_lower_the_verdict(tmp_path, cap
 
 
 def packed_elsewhere(record, into, python=sys.executable, **environ):
-    """Record and pack in another process, with other variables."""
+    """Record and pack in another process with other environment variables."""
     program = (
         "import honest_runs, mjrec, pathlib, sys\n"
         "into = pathlib.Path(sys.argv[1])\n"
@@ -119,7 +119,7 @@ NARROW = {"LP_NATIVE_VECTOR_WIDTH": "128", "GALLIUM_OVERRIDE_CPU_CAPS": "sse4.1"
 @pytest.mark.thorough
 @pytest.mark.parametrize("environ", [{"MUJOCO_GL": "osmesa"}, NARROW])
 def test_run_comes_out_again_with_another_rasterizer(environ, tmp_path):
-    """Its frames may differ a little, and that is claimed."""
+    """Frames may differ slightly, which the archive claims."""
     found = mjrec.verify(packed_elsewhere(honest.large, tmp_path, **environ))
     said = "\n".join(map(str, [*found.findings, *found.excuses]))
     assert found.verdict in (PASS, PARTLY), said
@@ -131,7 +131,7 @@ def test_run_comes_out_again_with_another_rasterizer(environ, tmp_path):
 )
 @pytest.mark.parametrize("record", [honest.pendulum, honest.cheetah, honest.mjcf])
 def test_run_comes_out_again_with_another_mujoco(record, tmp_path):
-    """Its steps differ a little, and what was compiled is believed."""
+    """Steps differ slightly, and the compiled model is believed."""
     archive = packed_elsewhere(record, tmp_path, os.environ["MJREC_TEST_MUJOCO"])
     found = mjrec.verify(archive)
     said = "\n".join(map(str, found.findings))

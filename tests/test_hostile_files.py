@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Malicious files: each gives one error, soon, and touches nothing else.
+"""Each malicious file causes one quick error and touches nothing else.
 
-Each is read in a fork with a gigabyte of memory (`hostile_reading`).
+The files are read in a fork with a gigabyte of memory (`hostile_reading`).
 """
 
 import contextlib
@@ -71,13 +71,13 @@ def directory(tmp_path):
 
 @pytest.mark.parametrize("kind", FILES)
 def test_valid_file_is_read(inspector, directory, kind):
-    """The tests below then refuse a file for its damage alone."""
+    """Damage is then the only reason for the refusals below."""
     reader, write = FILES[kind]
     inspector.reads(reader, write(directory))
 
 
 def listening_socket(path):
-    # A socket's path must be short.
+    # The path of a socket must be short.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path.name)
 
@@ -93,8 +93,8 @@ PATHS = {
     ),
 }
 ALLOWED = {
-    ("mjcf", "link elsewhere"),  # the user named it
-    ("h5", "folder"),  # its files are listed
+    ("mjcf", "link elsewhere"),  # The user named this path.
+    ("h5", "folder"),  # The files of a folder are listed.
 }
 
 
@@ -150,7 +150,7 @@ def test_corrupt_content_is_refused(inspector, directory, kind, corruption):
     CORRUPTIONS[corruption](path)
     if kind == "journal":
         os.truncate(path, min(path.stat().st_size, 1 << 28))
-    # MuJoCo decides how it reads a file that the user named.
+    # MuJoCo itself reads files that the user names.
     may_be_read = {"mjcf", "spans"} if corruption == "sparse terabyte" else set()
     if kind in {"journal", ".log", ".tail", ".looks"} | may_be_read:
         assert inspector.read(reader, path).kind in ("value", "refused")
@@ -184,7 +184,7 @@ def replaced(name, **options):
 
 
 def virtual_dataset(file):
-    """Make a dataset whose shape depends on how many files exist."""
+    """Make a dataset whose shape depends on the number of existing files."""
     whole = h5py.h5s.create_simple((4,), (h5py.h5s.UNLIMITED,))
     whole.select_hyperslab((0,), (h5py.h5s.UNLIMITED,), (1,), (1,))
     part = h5py.h5s.create_simple((1,))
@@ -281,7 +281,7 @@ HDF5 = [
 
 
 def first_line(rows, version=1):
-    """Return the first line of a foreign journal."""
+    """Return the first line of another journal."""
     values = {"number": 0, "version": version, "dtype": rows, "facts": {}}
     return json.dumps({"rows": values}).encode() + b"\n"
 
@@ -337,9 +337,9 @@ GZIP = [
         for packed in (
             VALID + gzip.compress(b"more"),
             gzip.compress(b"") * 100_000 + VALID,
-            # An endless name.
+            # The name in this header never ends.
             VALID[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
-            # Cut off, a wrong checksum, bytes at the end.
+            # These streams are cut off, have a wrong checksum, or have trailing bytes.
             *(VALID[:-1], VALID[:-8] + bytes(8), VALID + b"tail"),
         )
     ),
@@ -378,7 +378,7 @@ ZIP = {
     "nested too deeply": {"contents.json": b"[" * 100_000},
     "other": {"contents.json": b'{"format": 1, "main": "other"}'},
     "dict": {"contents.json": b'{"format": 1, "main": {}}'},
-    # An index that MuJoCo would trust, objects, and names of other things.
+    # These fields hold an index that MuJoCo would trust, objects, or foreign names.
     "set from": field("geom_bodyid", np.array([10**6], np.int32)),
     "no model field .opt": field("opt.__class__", np.zeros(())),
     "Object arrays cannot be loaded": field("geom_rgba", np.array([[None] * 4])),
@@ -386,7 +386,7 @@ ZIP = {
     "no model field .aura": field("aura", np.zeros(1)),
 }
 INSIDE = "<mujoco><worldbody>%s</worldbody></mujoco>"
-# A megabyte of names, to search 400 million times.
+# A megabyte of names would take 400 million searches.
 MANY = "".join(f'<compiler meshdir="d{i}"/>' for i in range(20_000))
 MESHES = "".join(f'<mesh file="{i}"/>' for i in range(20_000))
 MJCF = (
@@ -404,7 +404,7 @@ MJCF = (
     f"<mujoco>{MANY}<asset>{MESHES}</asset></mujoco>",
 )
 
-# The kind of file, the attack, and the error.
+# Each entry has the kind of file, the attack, and the error.
 ATTACKS = [
     *(("manifest", partial(Path.write_bytes, data=d), e) for e, d in JSON.items()),
     *(("h5", partial(edit_hdf5, change), e) for change, e in HDF5),
@@ -426,14 +426,14 @@ ATTACKS = [
 ]
 
 
-# Takes more than five seconds: one file uses up its limit of CPU time.
+# Takes more than five seconds: one file reaches its limit of CPU time.
 @pytest.mark.parametrize(
     ("kind", "attack", "error"),
     ATTACKS,
     ids=[f"{number} {kind} {error}" for number, (kind, _, error) in enumerate(ATTACKS)],
 )
 def test_attack_gives_one_error(inspector, directory, kind, attack, error):
-    """The error names the reason, within limits of memory and time."""
+    """The error gives the reason, within limits of memory and time."""
     reader, write = FILES[kind]
     path = write(directory)
     attack(path)
@@ -455,7 +455,7 @@ NOTE = b'{"note": {"name": "%s", "facts": {"a": %%s}}}\n' % NAME.encode()
     ids=["nested", "duplicate fact", "large facts", "endless line", "no objects"],
 )
 def test_hostile_journal_lines_take_little_time_and_memory(inspector, directory, lines):
-    """The valid lines before them still count."""
+    """The valid lines before the hostile ones still count."""
     journal = journal_of_killed(directory)
     with journal.open("ab") as file:
         file.write(lines)
@@ -471,7 +471,7 @@ def write_foreign_journal(directory, name, version=1):
 
 
 def test_journal_names_only_its_own_recordings(directory):
-    """No path leads out of the directory or to another monitor's files."""
+    """No path leads outside the directory or to another monitor's files."""
     for name in (
         *("../x", "..", "", "a\0b", "\ud800", f"../{NAME}", f"{NAME}.h5", NAME * 9),
         trajectory_prefix("0.2", 27),
@@ -485,20 +485,20 @@ def test_journal_names_only_its_own_recordings(directory):
 
 
 def test_newer_format_asks_for_an_update(directory):
-    """Its log is neither guessed at nor removed."""
+    """A log in a newer format is neither guessed at nor removed."""
     journal = write_foreign_journal(directory, NAME, version=12)
     with pytest.raises(UnreadableFile, match=r"newer mjrec in .* 12.* 1: update mjr"):
         load_trajectory(directory / f"{NAME}.h5")
     log = directory / log_name(INFIX, 0)
     remove_if_done(log)
     assert log.exists()
-    for size in (100, 0):  # cut within its first line
+    for size in (100, 0):  # This cuts the journal within its first line.
         os.truncate(journal, size)
         assert recordings_in_flight(directory) == []
 
 
 def test_names_that_lead_elsewhere_are_ignored(directory):
-    """A pending video's path may begin like a name in the directory."""
+    """The path of a pending video may start like a name in the directory."""
     outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
     outside.write_bytes(b"")
     metadata(directory.parent)
@@ -510,7 +510,7 @@ def test_names_that_lead_elsewhere_are_ignored(directory):
     update_manifests(directory)
     assert read_manifest(path).videos == ()
     assert episode_of(name) is None
-    # Parsing so long a number would take minutes.
+    # Parsing such a long number would take minutes.
     assert episode_of(f"openaigym.video.0.7.video{'1' * 10**6}.mp4") is None
     assert infix_of("openaigym.episodes.0.7/../x.jsonl") is None
     assert not is_infix("1" * 10**6 + ".7")
@@ -518,7 +518,7 @@ def test_names_that_lead_elsewhere_are_ignored(directory):
 
 
 def test_environment_in_a_file_is_text(directory):
-    """Names in files are never imported, called or made an environment."""
+    """Names in files are never imported, called or turned into environments."""
     done = directory / "done"
     environment = {
         "framework": "gymnasium",
@@ -568,12 +568,12 @@ TEN_GIGABYTES = (
 
 @pytest.mark.parametrize(
     ("xml", "seconds", "reason"),
-    # mujoco 3.3 refuses such a texture itself.
+    # MuJoCo 3.3 refuses such a texture itself.
     [(ENDLESS, 3, "longer than 3 seconds"), (TEN_GIGABYTES, 100, "memory|too large")],
     ids=["endless", "ten gigabytes"],
 )
 def test_compiling_stops_at_its_limits(directory, xml, seconds, reason):
-    """The compiler exceeds time or memory; this process goes on."""
+    """The compiler exceeds its time or memory, and this process continues."""
     path = FILES["zip"][1](directory)
     write_zip({MAIN: xml.encode()}, path)
     with pytest.raises(UnreadableFile, match=reason):

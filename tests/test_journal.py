@@ -46,13 +46,13 @@ def test_entries_are_read_back(path, facts):
     writer.close()
     with pytest.raises(ClosedError, match="jsonl"):
         writer.append(NEXT)
-    # The text of NaN equals itself.
+    # NaN does not equal itself, but its text does.
     assert repr(read(path)) == repr([first, NEXT])
     assert not re.search("NaN|Infinity", path.read_text())
 
 
 def test_options_of_any_type_and_size_are_written(path):
-    """The journal has their repr, cut to a limit."""
+    """The journal stores their `repr`, truncated to a limit."""
     write(path, entry(3, options={"lock": re}), entry(3, options="x" * (1 << 24)))
     first, second = (json.loads(line) for line in path.read_text().splitlines())
     assert "module 're'" in first["options"]["lock"]["repr"]
@@ -61,7 +61,7 @@ def test_options_of_any_type_and_size_are_written(path):
 
 
 def test_cut_last_line_is_left_out(path, caplog):
-    """One warning names its number if it is known; writing goes on."""
+    """One warning gives the episode number if known, and writing continues."""
     later = entry(5)
     write(path, ENTRY, NEXT)
     whole = path.read_bytes()
@@ -98,7 +98,7 @@ def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
     write(path, late, NEXT, entry(4, reward=9.0), ENTRY, late)
     first, *rest = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + damage + b"".join(rest))
-    # The first of two lines with one number counts, in any order of numbers.
+    # The first line for a number counts, and numbers may be in any order.
     assert read(path) == [late, NEXT, ENTRY]
     [warning] = caplog.messages
     assert f"{path}: skipped 3 lines: the first is line 2" in warning
@@ -124,7 +124,7 @@ def test_reading_stops_at_a_thousand_damaged_lines(path, caplog):
 def test_failed_line_is_written_before_the_next_one(path):
     writer = JournalWriter(path)
     writer.append(ENTRY)
-    # A full disk takes only the first part of the line.
+    # A full disk accepts only the first part of the line.
     with (
         file_size_limit(path.stat().st_size + 10),
         pytest.raises(FileNotWritten, match="space"),
@@ -136,7 +136,7 @@ def test_failed_line_is_written_before_the_next_one(path):
     third = entry(5)
     writer.append(third)
     assert read(path) == [ENTRY, NEXT, third]
-    # A removed journal is an error; the next entry begins another.
+    # A removed journal is an error, and the next entry starts a new one.
     path.unlink()
     with pytest.raises(FileNotWritten, match="removed while being written"):
         writer.append(ENTRY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`keep=` chooses afterwards which episodes get a video."""
+"""`keep=` chooses which episodes get a video after they have ended."""
 
 import contextlib
 import logging
@@ -22,7 +22,7 @@ RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
 
 
 class ChosenReturns(gymnasium.Wrapper):
-    """Ends each episode when its return is reached, at 1.0 a step."""
+    """End each episode when its return reaches the given value, at 1.0 a step."""
 
     def __init__(self, env, returns, success=()):
         super().__init__(env)
@@ -59,12 +59,12 @@ def run(env, episodes):
 
 
 def numbers(paths):
-    """Return the episode numbers in file names."""
+    """Return the episode numbers in the file names."""
     return sorted(int(path.stem[-6:]) for path in paths)
 
 
 def choice_in(directory):
-    """Return the recorded episodes, whether the choice was made, and the choice."""
+    """Return the recorded episodes, whether a choice was made, and the choice."""
     details = manifest_of(directory)["mjrec"]
     keep = details["keep"]
     return details["schedule"]["recorded"], keep["decided"], keep["chosen"]
@@ -75,7 +75,7 @@ live_and_deferred = pytest.mark.parametrize("mode", ["live", "deferred"])
 
 @live_and_deferred
 def test_worst_n_are_kept(tmp_path, mode):
-    """There are never more than N candidates; trackers see only chosen videos."""
+    """There are never more than N candidates, and trackers see only chosen videos."""
     notified = {}
     tracker = Tracker()
     tracker.video = lambda _, video: notified.update(
@@ -85,7 +85,7 @@ def test_worst_n_are_kept(tmp_path, mode):
     with mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", **options) as monitor:
         for number in range(8):
             monitor.reset(seed=0)
-            # Two candidates and the running episode.
+            # These are two candidates and the running episode.
             assert len(list(tmp_path.glob("*.log"))) <= 3
             finish_episode(monitor)
             so_far = sorted(range(number + 1), key=lambda k: (RETURNS[k], k))[:2]
@@ -116,7 +116,7 @@ def test_worst_n_are_kept(tmp_path, mode):
 # Takes more than five seconds: a thousand episodes.
 @pytest.mark.thorough
 def test_a_thousand_episodes_take_the_disk_of_four(tmp_path):
-    """The disk holds the worst three so far and the running one."""
+    """The disk holds the worst three episodes so far and the running one."""
     returns = [(1019 - number) // 20 for number in range(1000)]
     in_logs = set()
     with mjrec.Monitor(
@@ -134,7 +134,7 @@ def test_a_thousand_episodes_take_the_disk_of_four(tmp_path):
 
 @live_and_deferred
 def test_first_n_failures_are_kept(tmp_path, mode):
-    """Each is drawn when it ends; after N, recording stops."""
+    """Each failure is rendered when it ends, and recording stops after N."""
     pole = pendulum(success=[True, False, True, False, False, True, False, False])
     options = {"keep": "failures:2", "render": mode, "workers": 1}
     with mjrec.Monitor(pole, tmp_path, **options) as env:
@@ -159,7 +159,7 @@ def longest(episodes):
 def test_rules_over_all_episodes_keep_all_until_close(
     keep, mode, kept, tmp_path, caplog
 ):
-    """One message says so; the manifest names the rule or function."""
+    """One message says so, and the manifest names the rule or function."""
     caplog.set_level(logging.INFO, "mjrec")
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=mode, workers=1) as env:
         run(env, 8)
@@ -181,7 +181,7 @@ def test_rules_over_all_episodes_keep_all_until_close(
     ],
 )
 def test_trajectories_are_kept_apart_from_videos(tmp_path, options, kept):
-    """An episode that lost its place promises no video."""
+    """The trajectory of an episode that lost its place promises no video."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
     assert numbers(tmp_path.glob("*.h5")) == kept
@@ -197,7 +197,7 @@ def test_trajectories_are_kept_apart_from_videos(tmp_path, options, kept):
 
 @live_and_deferred
 def test_incomplete_episodes_are_never_chosen(tmp_path, mode):
-    """Whether ended by reset or by close, they leave no files."""
+    """Episodes that a reset or `close` cuts short leave no files."""
     options = {"render": mode, "allow_early_reset": True, "workers": 1}
     with mjrec.Monitor(pendulum(), tmp_path, keep="worst:3", **options) as monitor:
         run(monitor, 1)
@@ -219,7 +219,7 @@ def confused(episodes):
     default=2,
 )
 def test_invalid_choice_loses_nothing(tmp_path, mode, options):
-    """One error names the function; all videos are there or pending."""
+    """One error names the function, and all videos are rendered or pending."""
     env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=mode)
     run(env, 3)
     with pytest.raises(mjrec.InvalidArgument, match=r"confused returned 3, .* 0, 1, 2"):
@@ -239,7 +239,7 @@ def test_invalid_choice_loses_nothing(tmp_path, mode, options):
 
 @parametrize("on_error", ["warn", "raise"])
 def test_full_disk_at_close_loses_no_chosen_video(tmp_path, on_error):
-    """The chosen videos are pending."""
+    """The chosen videos stay pending."""
     options = {"keep": "worst:2", "workers": 0, "on_error": on_error}
     env = mjrec.Monitor(pendulum(), tmp_path, **options)
     run(env, 8)
@@ -260,7 +260,7 @@ def test_full_disk_at_close_loses_no_chosen_video(tmp_path, on_error):
 
 @pytest.mark.parametrize(("returns", "kept"), [([2, 4], 0), ([4, 2], 1)])
 def test_full_disk_at_metadata_of_a_live_candidate(returns, kept, tmp_path):
-    """Its metadata is written when it is chosen; otherwise its files go."""
+    """The candidate's metadata is written if it is chosen; else its files go."""
 
     def full(video, metadata):
         raise mjrec.FileNotWritten(video, "No space left on device")
@@ -299,7 +299,7 @@ os.kill(os.getpid(), 9)
     default=2,
 )
 def test_killed_run_leaves_candidates_and_running_episode(tmp_path, mode, recovers):
-    """No choice was made; other episodes leave no files."""
+    """No choice was made, and the other episodes leave no files."""
     here = Path(__file__).parent
     run_python(PROGRAM, tmp_path, mode, here, status=-signal.SIGKILL)
     assert numbers(in_flight(tmp_path)) == [1, 3, 5]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of `keep=`: chosen among all episodes, or as episodes end."""
+"""Rules of `keep=` choose among all episodes, or as episodes end."""
 
 import math
 
@@ -14,7 +14,7 @@ from mjrec.recorder.keep_rules import RULES, Standing, keep_rule, selection_from
 
 
 def episodes(*returns, **facts):
-    """Return episodes in order; one without a return failed."""
+    """Return episodes in order, where one without a return has failed."""
     facts = {"terminated": [False] * len(returns), **facts}
     return [
         episode(n, reward=value, **{name: each[n] for name, each in facts.items()})
@@ -36,23 +36,23 @@ def selection_of(keep, ended):
 @pytest.mark.parametrize(
     ("returns", "keep", "expected"),
     [
-        # In the order of the rules, then by rank.
+        # Episodes are listed in the order of the rules, then by rank.
         ([5, 1, 4, 2, 3], "best,median,worst", "0 best, 4 median, 1 worst"),
         ([5, 1, 4, 2], "worst:2,best:2", "1 worst, 3 worst, 0 best, 2 best"),
-        # Ties go to the earlier episode, which may have all roles.
+        # Ties go to the earlier episode, which may have every role.
         ([2, 2, 2], "best,median,worst", "0 best, 0 median, 0 worst"),
         ([9, 5, 0, 5, 5], "median", "1 median"),
-        # The median of an even number is the lower one.
+        # The median of an even number of episodes is the lower middle one.
         ([1, 2, 3, 4], "median", "1 median"),
-        # NaN is below minus infinity.
+        # NaN ranks below minus infinity.
         (
             *([1, math.nan, -math.inf, math.inf], "worst:2,best"),
             "1 worst, 2 worst, 3 best",
         ),
-        # Failed episodes are neither best nor worst.
+        # A failed episode is neither best nor worst.
         ([None, None], "best:9,median,worst", ""),
         ([None, 3, 2], "worst", "2 worst"),
-        # Failed episodes count in a schedule.
+        # A failed episode counts in a schedule.
         ([None] + [0.0] * 29, "cubic", "0 cubic, 1 cubic, 8 cubic, 27 cubic"),
         ([1, 2, None], "all", "0 all, 1 all, 2 all"),
         ([1, 2], "none", ""),
@@ -63,20 +63,20 @@ def test_episodes_are_chosen_by_return(returns, keep, expected):
     assert ", ".join(f"{number} {role}" for number, role in found) == expected
 
 
-# Few values give ties.
+# Few distinct values produce ties.
 RETURNS = st.sampled_from([0.0, -0.0, 1.0, -2.5, 7.25, math.nan, math.inf, -math.inf])
 
 
 @given(st.lists(RETURNS, max_size=12), st.integers(1, 5))
 def test_selection_during_a_run_equals_sorting_at_its_end(rewards, count):
-    """It holds few candidates, except for the median."""
+    """The selection holds few candidates, except for the median."""
     # Episode numbers may have gaps.
     ended = [episode(3 + 2 * k, reward=reward) for k, reward in enumerate(rewards)]
     rank = {
         e.episode_id: (False, 0.0) if math.isnan(e.reward) else (True, e.reward)
         for e in ended
     }
-    # Python's sort is stable, also in reverse.
+    # Python's sort is stable, even in reverse.
     worst = sorted(rank, key=rank.get)
     best = sorted(rank, key=rank.get, reverse=True)
     middle = [rank[number] for number in worst][(len(worst) - 1) // 2 :][:1]
@@ -95,7 +95,7 @@ def test_selection_during_a_run_equals_sorting_at_its_end(rewards, count):
 
 
 def test_failures_follow_success_or_termination():
-    """Failed episodes count as failures; a selection stops after the last one."""
+    """A failed episode counts as a failure, and selection stops after the last one."""
     success, terminated = [True, False, None, None, None], [True, *[False] * 3, True]
     ended = episodes(1, 2, 3, None, 4, success=success, terminated=terminated)
     failures = [(number, "failure") for number in (1, 3, 4)]
@@ -109,7 +109,7 @@ def test_failures_follow_success_or_termination():
 
 
 def test_missing_episodes_count_but_are_never_chosen():
-    """Later episodes keep their numbers."""
+    """Missing episodes do not shift the numbers of later ones."""
     ended = [None, *episodes(None, 1.0)]
     assert roles("cubic", ended) == [(0, "cubic")]
     assert roles("all", ended) == [(0, "all"), (1, "all")]
@@ -156,7 +156,7 @@ def test_invalid_function_is_named_and_decides_nothing(keep, error):
 
 
 def test_unknown_rule_lists_the_rules():
-    """Monitors have fewer rules; some rules stand alone."""
+    """Monitors accept fewer rules, and some rules cannot be combined."""
     for keep in ("bset", "", "best:0", "best:x", "median:2", "best,"):
         with pytest.raises(UnknownName, match=r"best:N.*cubic, all, none"):
             keep_rule(keep)

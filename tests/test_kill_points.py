@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGKILL between any two things that a recorder or a finisher does to its files."""
+"""Kill a recorder or a finisher between any two changes to its files."""
 
 import itertools
 import shutil
@@ -40,15 +40,15 @@ def before(owner, name, when=lambda *_: True):
 
 
 def run(program, directory, place):
-    """Run a program; tell whether it was killed, and not over before that."""
+    """Run a program, and return whether it was killed before it finished."""
     done = run_python(START + program, directory, place, status=None)
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
-    # An encoder outlives it for a moment.
+    # An encoder briefly outlives its process.
     wait_until(lambda: not any(map(is_locked, directory.glob(".*.part"))))
     return done.returncode != 0
 
 
-# Kills the process before one of the renames, links, removals and openings for writing.
+# This kills the process before a rename, link, removal or opening for writing.
 COUNT = """
 left = int(place)
 
@@ -98,7 +98,7 @@ list(finish.finish(Path(directory), workers=1))
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """A directory with a pending video, and a copy in which that is rendered."""
+    """Return a directory with a pending video, and a rendered copy."""
     pending = tmp_path_factory.mktemp("rendered") / "pending"
     env = gymnasium.make("InvertedPendulum-v5", height=32, width=48)
     with mjrec.Monitor(env, pending, workers=0) as monitor:
@@ -128,7 +128,7 @@ def rendered(tmp_path_factory):
 def test_a_finisher_killed_beside_its_worker_is_taken_up_again(
     place, tmp_path, rendered
 ):
-    """The next one leaves every file as one that was never killed."""
+    """The next finisher leaves the same files as one that was never killed."""
     pending, done = rendered
     directory = tmp_path / "run"
     shutil.copytree(pending, directory)
@@ -142,12 +142,12 @@ def test_a_finisher_killed_beside_its_worker_is_taken_up_again(
 EVERY_EIGHTH = [range(first, 100, 8) for first in range(8)]
 
 
-# Takes more than five seconds: a process that finishes, for each moment.
+# Takes more than five seconds: a process finishes for each moment.
 @parametrize("moments", EVERY_EIGHTH, part=pytest.mark.crashes)
 def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
     moments, tmp_path, painter
 ):
-    """Of a dead monitor; with a trajectory that stays, and one that does not."""
+    """The monitor is dead, and only one of its two trajectories is kept."""
     for moment in moments:
         directory = tmp_path / str(moment)
         directory.mkdir()
@@ -157,7 +157,7 @@ def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
             write_log(directory, number, kept=kept, start_time=9.0)
             facts = {"terminated": False, "truncated": True, "recording": "deferred"}
             lines.append(entry(number, length=4, reward=2.0, chosen=True, **facts))
-        # The second line was cut off with its monitor, before it was written.
+        # The dead monitor had not yet written the second line.
         write_journal(directory, str(INFIX), lines[0])
         was_killed = run(FINISH, directory, moment)
         assert not any(each.failures for each in finish(directory, workers=1))
@@ -176,7 +176,7 @@ def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
         pytest.fail("there were more changes than moments")
 
 
-# An episode, the beginning of another one, and an encoder that has every frame.
+# This records one episode and part of another, and waits for the encoder.
 CUT = """
 from conftest import Corridor
 env = mjrec.Monitor(
@@ -198,13 +198,13 @@ assert not mjrec.recover(directory).failures
 
 
 def contents(directory):
-    """Return the content of each file; one who comes later says so in the journal."""
+    """Return each file's content without the journal's line about a recovery."""
     files = {path.name: path.read_bytes() for path in directory.iterdir()}
     said = b'{"recovered": {}}\n'
     return {name: content.replace(said, b"") for name, content in files.items()}
 
 
-# Takes more than five seconds: a process that recovers, for each moment.
+# Takes more than five seconds: a process recovers for each moment.
 @parametrize(
     ("mode", "moments"),
     itertools.product(("rgb_array", "ansi"), EVERY_EIGHTH),
@@ -213,11 +213,11 @@ def contents(directory):
 def test_a_recovery_killed_at_any_change_of_a_file_is_taken_up_again(
     mode, moments, tmp_path
 ):
-    """Of live videos; the next one leaves every file as one alone would have."""
+    """The next recovery leaves the same files as one that was never killed."""
 
     def copied(name):
         shutil.copytree(tmp_path / "cut", tmp_path / name)
-        # A copy of a second name is another file.
+        # A hard link becomes a separate file when copied.
         for link in (tmp_path / name).glob("a-*"):
             link.unlink()
         return tmp_path / name
@@ -304,7 +304,7 @@ LIVE = (
 
 @parametrize("place", [*DEFERRED, *LIVE], default=8)
 def test_a_recorder_killed_between_two_things_loses_no_episode(place, tmp_path):
-    """Rows, journal, encoder and names: whichever of them was first."""
+    """It does not matter which of the rows, journal, encoder and names came first."""
     assert run(f"LIVE = {LIVE!r}\n{RECORD}", tmp_path, place)
     assert not mjrec.recover(tmp_path).failures
     assert not mjrec.recover(tmp_path)
@@ -314,7 +314,7 @@ def test_a_recorder_killed_between_two_things_loses_no_episode(place, tmp_path):
     if place in LIVE:
         assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [3, 3]
         facts = [metadata_of(tmp_path, number) for number in (0, 1)]
-        # At most four a second, and the last one.
+        # At most four frames a second are shown, and the last one.
         assert [each["frame_steps"] for each in facts] == [[[0, 3], [4, 4]]] * 2
     else:
         paths = sorted(tmp_path.glob("*.h5"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of the local engine, what `test_engines` does not try on every one."""
+"""Test what only the local engine promises, beyond `test_engines`."""
 
 import os
 import signal
@@ -39,7 +39,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("options", "said"), WRONG)
 def test_what_cannot_be_is_refused_before_anything_starts(options, said):
-    """Workers are one for each CPU, unless their number is given."""
+    """The default number of workers is the number of CPUs."""
     with pytest.raises(InvalidArgument, match=said):
         LocalEngine(**options)
     assert LocalEngine().workers == usable_cpus()
@@ -47,7 +47,7 @@ def test_what_cannot_be_is_refused_before_anything_starts(options, said):
 
 
 def test_an_engine_that_was_shut_down_or_forgotten():
-    """It takes no more jobs, and leaves no thread; those before are done."""
+    """Accepted jobs are done, new ones are refused, and no thread remains."""
     engine = LocalEngine(2)
     calls = [engine.submit(len, "abc") for _ in range(5)]
     assert [call.result() for call in calls] == [3] * 5
@@ -60,11 +60,11 @@ def test_an_engine_that_was_shut_down_or_forgotten():
 
 @pytest.mark.thorough
 def test_children_share_the_gpus_that_there_are(tmp_path, monkeypatch, caplog):
-    """Two share the first, and are told that they draw in software, or may not."""
+    """Two children share the first GPU, and a warning or error says it is not used."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     os.mkfifo(tmp_path / "pipe")
     with Run(LocalEngine(2, gpus=0.5), odd_work()) as run:
-        # Both at once, so that each is done by a child of its own.
+        # The jobs meet at a pipe, so each needs its own child.
         for key, mode in (("a", "rb"), ("b", "wb")):
             submit(run, key, do="meet", pipe=str(tmp_path / "pipe"), mode=mode)
         met = {value["pid"]: value["gpus"] for value in values(run)}
@@ -88,13 +88,13 @@ def test_children_share_the_gpus_that_there_are(tmp_path, monkeypatch, caplog):
     ],
 )
 def test_gpus_are_filled_one_after_the_other(each, gpus, given):
-    """As many workers as share one get the same; further ones go round again."""
+    """Workers that share a GPU are adjacent, and more workers start over."""
     share = GpuShare(each=each)
     assert [share.of(seat, gpus) for seat in range(8)] == given
 
 
 def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path):
-    """Its end is its end, whatever holds copies of what it had open."""
+    """A dead child counts as ended even if its children hold its open files."""
     with Run(LocalEngine(1), odd_work()) as run:
         submit(run, "a", do="fork", children=str(tmp_path / "children"))
         assert "was killed by SIGKILL" in (outcomes(run)["a"].failure or "")
@@ -104,7 +104,7 @@ def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path):
 
 
 def test_what_cannot_be_started(monkeypatch):
-    """The error names it."""
+    """The error names the executable."""
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     with Run(LocalEngine(1), odd_work()) as run:
         submit(run, "a", do="echo")
@@ -113,7 +113,7 @@ def test_what_cannot_be_started(monkeypatch):
 
 
 def test_what_jobs_print_is_passed_on(capsys, monkeypatch):
-    """Line by line, more than a pipe holds; where there is a standard error."""
+    """Long lines arrive whole, and without a standard error nothing is passed on."""
     with Run(LocalEngine(2), odd_work()) as run:
         submit(run, "a", do="talk", more=1_000_000)
         values(run)
@@ -133,7 +133,7 @@ def test_what_jobs_print_is_passed_on(capsys, monkeypatch):
 
 
 def test_ctrl_c_while_results_come(tmp_path):
-    """It is raised at once, and leaving `with` ends what the children are at."""
+    """The interrupt is raised at once, and leaving `with` ends the running jobs."""
     run = Run(LocalEngine(1), odd_work())
     submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
     pid = wait_for(tmp_path / "begun", run)
@@ -154,10 +154,10 @@ SAID = f"{[str(number) for number in range(9)]}\n"
 
 
 def test_from_wherever_the_caller_is(tmp_path):
-    """From standard input, from a script without a guard, in a daemonic process."""
+    """The caller may be standard input, an unguarded script, or a daemonic process."""
     assert run_python("-", text=CALLER) == SAID
     (tmp_path / "script.py").write_text(CALLER)
-    # What lies beside it is not taken for Python's own modules.
+    # A module next to the script must not replace one of Python's own.
     (tmp_path / "random.py").write_text("raise RuntimeError('not this one')")
     assert run_python(str(tmp_path / "script.py")) == SAID
     daemonic = f"""
@@ -186,7 +186,7 @@ wait_for(Path(sys.argv[1]), run)
 
 
 def test_children_end_with_their_driver(tmp_path):
-    """In mid-job; at interpreter exit nothing waits for them."""
+    """Children end in the middle of a job, and interpreter exit does not wait."""
     with driver(tmp_path, "LocalEngine(1)") as process:
         process.kill()
     wait_for_end(*map(int, lines(tmp_path / "begun")))

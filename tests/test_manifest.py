@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Manifest and statistics are gym's, safe to read, and follow from the journal."""
+"""Manifest and statistics are like gym's, safe to read, and follow from the journal."""
 
 import gymnasium
 import pytest
@@ -39,7 +39,7 @@ STATS_TEXT = (
     ],
 )
 def test_damage_of_manifest_and_statistics_is_named(tmp_path, content, reason):
-    """Each kind is one clear error."""
+    """Each kind of damage is one clear error."""
     path = tmp_path / "openaigym.some.0.1.json"
     read = read_manifest
     if content is not None:
@@ -64,11 +64,11 @@ OPTIONS = {
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_another_process_computes_the_same(options, tmp_path):
-    """Nothing is new for it; and made from nothing, both files are the same again."""
+    """Existing files are already up to date, and deleted ones are restored."""
     view = {"render_mode": "rgb_array", "width": 32, "height": 32}
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=5, **view)
     with mjrec.Monitor(env, tmp_path, **options) as monitor:
-        # The third one is closed early.
+        # The third episode is closed early.
         for seed, steps in enumerate((5, 5, 1)):
             monitor.reset(seed=seed)
             for _ in range(steps):
@@ -84,16 +84,16 @@ def test_another_process_computes_the_same(options, tmp_path):
     assert manifest_of(tmp_path) == manifest
     first = stats.pop("initial_reset_timestamp")
     anew = stats_of(tmp_path)
-    # The moment before the first reset stands in no episode.
+    # No episode states the time before the first reset.
     assert anew.pop("initial_reset_timestamp") >= first
     assert anew == stats
 
 
 def test_an_episode_that_was_cut_is_in_the_journal(tmp_path, corridor):
-    """With its reason, and whether it was chosen; it is no part of the statistics."""
+    """The line gives the reason and the choice, and statistics omit the episode."""
     env = mjrec.Monitor(corridor, tmp_path, allow_early_reset=True)
     env.reset()
-    # The manifest of a monitor that is open is left to it.
+    # Others must not write the manifest of an open monitor.
     assert write_manifest_and_stats(tmp_path, env.infix) is None
     assert not list(tmp_path.glob("*.manifest.json"))
     env.step(0)

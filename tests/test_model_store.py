@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models are stored once; damaged and hostile files are refused."""
+"""Models are stored once, and damaged or hostile files are refused."""
 
 import io
 import json
@@ -39,7 +39,7 @@ SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 @pytest.fixture
 def mjcf(tmp_path):
-    """A model of four files in three directories."""
+    """Return the path of a model whose four files are in three directories."""
     image = io.BytesIO()
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(image, "PNG")
     for name, content in {
@@ -75,7 +75,7 @@ def store_model(directory, model, authored=None):
     return json.loads(json.dumps(facts))
 
 
-# Makes this MuJoCo another version than the recorded one.
+# Pretend that another MuJoCo version recorded the model.
 OTHER_VERSION = {"mujoco": "3.1.4"}
 
 
@@ -112,13 +112,13 @@ def test_storing_can_be_tried_again_after_a_full_disk(directory):
                 store.finish()
     assert list(directory.iterdir()) == []
     store.finish()
-    # The trust list had no room either.
+    # There was no room for the trust list either.
     assert load_model(directory, facts, trust_models=True).ngeom == 1
     store.finish()
 
 
 def test_another_version_compiles_the_sources(directory, mjcf):
-    """The original files may be gone; changes to the model are applied again."""
+    """The original files may be gone, and later model changes are applied again."""
     authored = authored_from_file(mjcf)
     assert authored.main == "model/main.xml"
     assert sorted(authored.files) == [
@@ -134,7 +134,7 @@ def test_another_version_compiles_the_sources(directory, mjcf):
     again = load_model(directory, {**facts, **OTHER_VERSION})
     assert (again.vis.global_.offwidth, again.stat.extent) == (1234, 3.5)
     np.testing.assert_array_equal(again.opt.gravity, [0, 1, 2])
-    # `_sizes` and these addresses depend on where the files were.
+    # `_sizes` and these addresses depend on the location of the files.
     names = [n for n in dir(model) if isinstance(getattr(model, n), np.ndarray)]
     for name in names:
         if not name.endswith("pathadr") and name != "_sizes":
@@ -170,7 +170,7 @@ TEXT = "<mujoco><custom><text name='t' data='{}'/></custom></mujoco>"
     ids=["other shape", "other text"],
 )
 def test_sources_of_another_model_are_not_stored(directory, other):
-    """The compiled model is stored; another version's error says what to do."""
+    """The compiled model is stored, and an error in another version says what to do."""
     source = TEXT.format("two") if "text" in other else SPHERE
     model = mujoco.MjModel.from_xml_string(other)
     authored = AuthoredModel("a.xml", {"a.xml": source.encode()})
@@ -219,7 +219,7 @@ def test_damaged_file_is_one_error(directory, mjcf, kind, damage):
     "name", ["../openaigym.model.0123456789abcdef.zip", "/etc/passwd", 7, "model.zip"]
 )
 def test_facts_cannot_name_other_files(directory, name):
-    """A missing model's error says where to find it."""
+    """For a missing model, the error says where to copy it from."""
     facts = store_model(directory, sphere())
     (directory / facts["mjb"]).unlink()
     with pytest.raises(UnreadableFile, match="copy it from the directory"):

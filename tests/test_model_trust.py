@@ -53,7 +53,7 @@ def trust_list(tmp_path, monkeypatch):
 
 @pytest.fixture
 def fallback(tmp_path):
-    """The list's path while the home directory is not writable."""
+    """Return the path of the list that is used when the home is not writable."""
     return tmp_path / f"tmp/mjrec-{os.geteuid()}/models"
 
 
@@ -80,7 +80,7 @@ def digest_of(content):
 
 
 def test_trust_list_is_private_to_its_user(trust_list, become_another_user):
-    """The first model makes it; each model is in it once, in order."""
+    """The first model creates the list, which has each model once, in order."""
     assert not is_stored(DIGEST)
     note_models([])
     assert not trust_list.parent.exists()
@@ -117,7 +117,7 @@ def test_concurrent_writers_lose_no_line(trust_list):
 
 
 def test_trust_list_forgets_the_oldest_models(trust_list, monkeypatch):
-    """A task may compile a model for each episode."""
+    """The list must be limited because a task may compile a model per episode."""
     monkeypatch.setattr(model_trust, "_MOST_BYTES", 10 * 66)
     models = list(map(digest_of, range(35)))
     for model in models:
@@ -131,7 +131,7 @@ def test_trust_list_forgets_the_oldest_models(trust_list, monkeypatch):
 def test_unwritable_home_uses_the_fallback_list(
     tmp_path, fallback, monkeypatch, caplog
 ):
-    """There is no warning, and its models stay trusted later."""
+    """There is no warning, and models in the fallback list stay trusted."""
     note_models([DIGEST])
     with file_size_limit(70):
         note_models([OTHER])
@@ -141,7 +141,7 @@ def test_unwritable_home_uses_the_fallback_list(
         patch.setenv("XDG_STATE_HOME", "/dev/null/state")
         note_models([third := digest_of(3)])
     assert all(map(is_stored, [DIGEST, OTHER, third]))
-    # A cron job has no variables: the password file names the home.
+    # A cron job has no variables, so the password file gives the home directory.
     user = type("User", (), {"pw_dir": str(tmp_path / "home")})
     monkeypatch.setattr("pwd.getpwuid", lambda uid: user)
     monkeypatch.setenv("XDG_STATE_HOME", "relative/is/ignored")
@@ -162,7 +162,7 @@ def test_unwritable_home_uses_the_fallback_list(
     ids=["pipe", "link", "mode", "owner"],
 )
 def test_list_that_others_can_write_is_not_used(trust_list, fallback, caplog, tamper):
-    """The file stays; a warning says what to do."""
+    """The file stays, and a warning says what to do."""
     note_models([DIGEST])
     tamper(trust_list)
     before = trust_list.lstat()
@@ -200,7 +200,7 @@ def test_remote_worker_loads_models_of_its_user(
 
 
 def forbid_compiled_models(patch, directory):
-    """Fail where MuJoCo loads a compiled model of the directory."""
+    """Fail if MuJoCo loads a compiled model from the directory."""
     load = mujoco.MjModel.from_binary_path
 
     def loaded(path, *assets):
@@ -214,7 +214,7 @@ def forbid_compiled_models(patch, directory):
 
 @pytest.mark.parametrize("changes", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
 def test_untrusted_models_never_reach_mujoco(directory, monkeypatch, changes):
-    """The error names the file and the ways out; another model's hash does not help."""
+    """The error names the file and remedies; another model's hash does not help."""
     facts = {**store_model(directory), "xml": None}
     content = bytearray(gzip.decompress((directory / facts["mjb"]).read_bytes()))
     content[-200:] = bytes(200)
@@ -233,7 +233,7 @@ def test_untrusted_models_never_reach_mujoco(directory, monkeypatch, changes):
 
 
 def test_argument_or_variable_grants_trust(directory, become_another_user, monkeypatch):
-    """The hash is checked all the same; one's own models need no trust."""
+    """The hash is still checked, and the user's own models need no trust."""
     facts = {**store_model(directory), "xml": None}
     assert load_model(directory, facts).ngeom == 1
     become_another_user()
@@ -252,7 +252,7 @@ def test_argument_or_variable_grants_trust(directory, become_another_user, monke
 def test_rendering_a_foreign_recording_needs_trust(
     directory, become_another_user, tmp_path, capsys
 ):
-    """Python's or the command's argument grants it, also to the workers."""
+    """An argument of the function or command grants trust, to workers as well."""
     theirs = record(directory)
     become_another_user()
     trajectory = load_trajectory(theirs.path)

@@ -42,25 +42,25 @@ def recorded(pendulums):
 
 @pytest.fixture(scope="module")
 def archive(recorded, tmp_path_factory):
-    """Return it packed."""
+    """Return the packed archive of the recorded directory."""
     return mjrec.pack(recorded, tmp_path_factory.mktemp("packed") / "run.zip", **STATED)
 
 
 @pytest.fixture(scope="module")
 def bag(archive, tmp_path_factory):
-    """Return that unpacked."""
+    """Return the unpacked folder of the archive."""
     return unpacked(archive, tmp_path_factory.mktemp("unpacked"))
 
 
 @pytest.fixture(scope="module")
 def infix(recorded):
-    """Return what the names of its files have in common."""
+    """Return the infix of the recorded files."""
     name = the(recorded, "*.jsonl").name
     return name.removeprefix("openaigym.episodes.").removesuffix(".jsonl")
 
 
 def packed_bytes(path):
-    """Return what is packed of a file: of a journal all but the lines about logs."""
+    """Return the packed content of a file, which omits a journal's lines about logs."""
     lines = path.read_bytes().splitlines(keepends=True)
     is_journal = path.suffix == ".jsonl"
     return b"".join(x for x in lines if not (is_journal and is_of_spans(x)))
@@ -87,7 +87,7 @@ def actions_of(entities):
 
 
 def test_it_holds_the_recordings_unchanged(recorded, bag, tmp_path):
-    """Every file, byte for byte, also under a limit that is kept anyway."""
+    """Every file is equal byte for byte, even under a limit that is not reached."""
     assert bag.name == "run"
     limited = packed_and_unpacked(recorded, tmp_path, max_size="5M")
     for folder in (bag, limited):
@@ -98,7 +98,7 @@ def test_it_holds_the_recordings_unchanged(recorded, bag, tmp_path):
 
 
 def test_other_programs_take_the_bag(bag):
-    """The `bagit` package, and sha512sum, as the README says."""
+    """The bag is valid for the `bagit` package and for sha512sum."""
     assert (bag / "bagit.txt").read_text().startswith("BagIt-Version: 1.0\n")
     for command in (
         [sys.executable, "-m", "bagit", "--validate", "."],
@@ -108,7 +108,7 @@ def test_other_programs_take_the_bag(bag):
 
 
 def test_names_in_the_zip_are_plain(archive):
-    """One folder, sorted, no times, no owners, what is compressed already stored."""
+    """All names are sorted in one folder, without times or owners."""
     with zipfile.ZipFile(archive) as packed:
         infos = packed.infolist()
     names = [info.filename for info in infos]
@@ -121,10 +121,7 @@ def test_names_in_the_zip_are_plain(archive):
 
 
 def test_the_same_input_gives_the_same_bytes(recorded, archive, tmp_path, monkeypatch):
-    """From a copy with other times, in another order, elsewhere, with another umask.
-
-    Also where files cannot be linked, as from another file system.
-    """
+    """Times, order, location, umask and lack of hard links do not matter."""
     (tmp_path / "copy").mkdir()
     for path in sorted(recorded.iterdir(), reverse=True):
         shutil.copyfile(path, tmp_path / "copy" / path.name)
@@ -144,7 +141,7 @@ def test_the_same_input_gives_the_same_bytes(recorded, archive, tmp_path, monkey
 
 
 def test_packing_changes_nothing_else(recorded, tmp_path):
-    """Neither the recordings, nor the working directory, also from a thread."""
+    """The recordings and the working directory stay the same, even from a thread."""
 
     def status():
         found = {path: path.stat() for path in recorded.iterdir()}
@@ -159,13 +156,13 @@ def test_packing_changes_nothing_else(recorded, tmp_path):
         packing.join(0.001)
     assert seen | {Path.cwd()} == {place}
     assert [path.name for path in tmp_path.iterdir()] == ["a.zip"]
-    # The links that were made of it are gone.
+    # Temporary links to the recordings are gone.
     assert {links for _, links, _ in before.values()} == {1}
     assert status() == before
 
 
 def test_the_table_says_what_the_journal_says(recorded, infix, bag):
-    """A row an episode, in order, with the same bits in every number."""
+    """There is one row per episode, in order, with bit-identical numbers."""
     with (bag / "data/statistics.csv").open(newline="") as file:
         table = csv.DictReader(file)
         rows = list(table)
@@ -184,7 +181,7 @@ def test_the_table_says_what_the_journal_says(recorded, infix, bag):
 
 
 def test_the_crate_has_what_its_specification_wants(bag):
-    """What RO-Crate 1.1 and Process Run Crate 0.5 call MUST."""
+    """The crate meets every MUST of RO-Crate 1.1 and Process Run Crate 0.5."""
     entities = entities_of(bag)
     descriptor = entities["ro-crate-metadata.json"]
     assert descriptor["about"] == {"@id": "./"}
@@ -218,7 +215,7 @@ def references_in(value):
 
 
 def test_the_crate_describes_every_file_and_nothing_else(bag):
-    """Every reference leads to an entity, and every entity of a file to a file."""
+    """Every reference leads to an entity, and every file entity to a file."""
     entities = entities_of(bag)
     sizes = {
         path.relative_to(bag / "data").as_posix(): str(path.stat().st_size)
@@ -241,7 +238,7 @@ def test_the_crate_describes_every_file_and_nothing_else(bag):
 
 
 def test_the_citation_is_valid(bag):
-    """YAML, with what the format demands."""
+    """The file is YAML with the required fields."""
     cited = yaml.safe_load((bag / "data/CITATION.cff").read_text())
     ada = {"family-names": "Lovelace", "given-names": "Ada"}
     guido = {"family-names": "van Rossum", "given-names": "Guido", "email": "g@x.org"}
@@ -255,7 +252,7 @@ def test_the_citation_is_valid(bag):
 
 
 def test_the_environment_says_what_drew_encoded_and_packed(recorded, infix, bag):
-    """Beside what the recording says of its own provenance."""
+    """The file also has the provenance of the recording."""
     content = json.loads((bag / "data/environment.json").read_text())
     said, metadata = content["recordings"][infix], metadata_of(recorded, 0)
     details = manifest_of(recorded)["mjrec"]
@@ -277,7 +274,7 @@ def test_the_environment_says_what_drew_encoded_and_packed(recorded, infix, bag)
 
 
 def test_the_readme_leads_a_stranger(infix, recorded, bag):
-    """What it is, how to verify it, what was shown, by which rule."""
+    """It covers what the run is, how to verify it, and how videos were chosen."""
     returns = mjrec.load_results(recorded)["episode_rewards"]
     text = readme_of(bag)
     for part in (
@@ -296,7 +293,7 @@ def test_the_readme_leads_a_stranger(infix, recorded, bag):
 
 
 def test_the_readme_leads_to_a_replay(bag, tmp_path, monkeypatch):
-    """Its commands make a page of an episode, in a copy of the recordings."""
+    """Its commands copy the recordings and make a page for an episode."""
     monkeypatch.chdir(shutil.copytree(bag, tmp_path / "bag"))
     copy, replay = re.findall(r"(?:    (cp .*)|`mjrec (replay .*?)`)", readme_of(bag))
     subprocess.run(copy[0].split(), check=True)
@@ -305,7 +302,7 @@ def test_the_readme_leads_to_a_replay(bag, tmp_path, monkeypatch):
 
 
 def test_the_readme_says_what_environments_were_made_with(tmp_path):
-    """Which makes another environment of one with a name that everybody knows."""
+    """Arguments and wrappers can make a well-known environment a different one."""
     env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
     env = gymnasium.wrappers.ClipReward(env, 1.0)
     kept = {"video_callable": False, "trajectory_callable": True}
@@ -318,7 +315,7 @@ def test_the_readme_says_what_environments_were_made_with(tmp_path):
 
 
 def test_nothing_need_be_stated(recorded, tmp_path):
-    """Then that is said, where something has to be."""
+    """Where a statement is required, the archive says that none was given."""
     folder = packed_and_unpacked(recorded, tmp_path)
     root = entities_of(folder)["./"]
     assert root["name"] == "Recordings of InvertedPendulum-v5"
@@ -331,13 +328,13 @@ def test_nothing_need_be_stated(recorded, tmp_path):
 
 @pytest.fixture(scope="module")
 def one_chosen(recorded, tmp_path_factory):
-    """Return the folder of an archive of episode 1 alone, chosen by a NumPy integer."""
+    """Return the unpacked archive of episode 1, chosen by a NumPy integer."""
     place = tmp_path_factory.mktemp("chosen")
     return packed_and_unpacked(recorded, place, episodes=np.array([1]))
 
 
 def test_some_episodes_can_be_chosen(recorded, infix, one_chosen, names):
-    """Statistics stay whole, nothing is promised, and all say that it is a choice."""
+    """Statistics stay whole, nothing is pending, and the archive names the choice."""
     packed = one_chosen / "data/recordings"
     assert videos_in(packed) == [1]
     left_out = set(names(recorded)) - set(names(packed))
@@ -351,12 +348,12 @@ def test_some_episodes_can_be_chosen(recorded, infix, one_chosen, names):
     assert not [each for each in mjrec.iter_episodes(packed) if each.pending]
     said = json.loads((one_chosen / "data/environment.json").read_text())
     assert said["packed_with"]["options"]["episodes"] == [1]
-    # In the original it is as it was.
+    # The original directory is unchanged.
     assert videos_in(recorded) == [0, 1]
 
 
 def test_actions_of_all_episodes_stay(recorded, infix, one_chosen):
-    """Anyone can make the others again; only states are left out, as is said."""
+    """Others can recreate the episodes, because only their states are left out."""
     name = f"openaigym.trajectory.{infix}.episode000000.h5"
     folders = (recorded, one_chosen / "data/recordings")
     before, after = (mjrec.load_trajectory(folder / name) for folder in folders)
@@ -378,7 +375,7 @@ def test_actions_of_all_episodes_stay(recorded, infix, one_chosen):
 
 
 def test_commands_in_the_readme_can_be_pasted(recorded, tmp_path):
-    """A shell takes the archive's name as one argument, whatever is in it."""
+    """A shell reads the name as one argument, whatever characters it has."""
     name = "it's $(here); a `run` & more.zip"
     folder = unpacked(mjrec.pack(recorded, tmp_path / name), tmp_path / "x")
     lines = readme_of(folder).splitlines()
@@ -387,7 +384,7 @@ def test_commands_in_the_readme_can_be_pasted(recorded, tmp_path):
 
 
 def test_more_files_than_verify_takes_are_refused(recorded, tmp_path, monkeypatch):
-    """Before any work, and with the way out."""
+    """Nothing is written, and the error names the remedy."""
     monkeypatch.setattr("mjrec.evidence.pack.MOST_ENTRIES", 20)
     with pytest.raises(mjrec.PackError, match=r"at most 20 files.*--episodes"):
         mjrec.pack(recorded, tmp_path / "run.zip")
@@ -396,7 +393,7 @@ def test_more_files_than_verify_takes_are_refused(recorded, tmp_path, monkeypatc
 
 @pytest.mark.thorough
 def test_models_of_other_episodes_are_left_out(tmp_path):
-    """What nothing in the archive refers to would be called an extra file."""
+    """Unreferenced files would count as extra files."""
     directory = tmp_path / "runs"
     record_pendulum(directory, 1)
     stray = directory / "openaigym.model.0123456789abcdef.mjb.gz"
@@ -412,7 +409,7 @@ def test_models_of_other_episodes_are_left_out(tmp_path):
 
 
 def test_two_monitors_are_two_actions(recorded, tmp_path):
-    """Each with its own files; a choice of episodes is of both."""
+    """Each action has its own files, and a choice of episodes applies to both."""
     directory = shutil.copytree(recorded, tmp_path / "runs")
     record_pendulum(directory, 1, uid="other", resume=True)
     entities = entities_of(packed_and_unpacked(directory, tmp_path, episodes=[0]))
@@ -429,7 +426,7 @@ def largest_video(archive):
 
 @pytest.mark.thorough
 def test_videos_are_drawn_smaller_for_a_limit(tmp_path):
-    """All frames of them, with hashes of their own; the recording stays as it was."""
+    """All frames are kept with new hashes, and the recording does not change."""
     directory = tmp_path / "runs"
     small = {"render_mode": "rgb_array", "height": 240, "width": 320}
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **small)

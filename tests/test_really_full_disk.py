@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file system that is full: what was recorded before and after is there."""
+"""Recording on a full file system keeps everything from before and after."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ STEPS = 8
 
 @pytest.fixture
 def disk(tmp_path):
-    """A file system of two megabytes."""
+    """Mount a file system of two megabytes."""
     if os.geteuid() != 0:
         pytest.skip("mounting a small file system takes root")
     place = tmp_path / "disk"
@@ -57,10 +57,10 @@ monitor.close(wait=False)
 @pytest.mark.parametrize("ending", ["closed", "killed"])
 @pytest.mark.parametrize("room", [0, 4096, 65536])
 def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
-    """Whether the monitor closes when there is room again, or never does.
+    """Test a monitor that closes once there is room, and one that is killed.
 
-    Rows tell what lines could not, and nothing claims what is not so. Without any room
-    the third cannot begin; that it was played is said when there is room.
+    Rows replace missing journal lines, and no file makes a false claim. Without any
+    room the third episode has no file, but closing with room still counts it.
     """
     run_python(PROGRAM, disk, room, ending, status=0 if ending == "closed" else -9)
     (disk / "filler").unlink(missing_ok=True)
@@ -103,7 +103,7 @@ monitor.close(wait=False)
 
 @pytest.mark.parametrize("on_error", ["raise", "warn"])
 def test_a_trajectory_without_room_for_its_last_rows_ends_with_them(on_error, disk):
-    """Length and reward are those of its rows; the episode is counted as it was."""
+    """Length and reward match the rows, and statistics count the whole episode."""
     run_python(CUT, disk, on_error)
     run = disk / "run"
     mjrec.recover(run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recovering a directory: processes are killed, and nothing of theirs is lost."""
+"""Recovering a directory loses nothing of the processes that were killed."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ import mjrec
 from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import lock_name, log_name, video_prefix
 
-# A corridor of 12 steps, or a cheetah's 12 steps; what is to be done comes in code.
+# A corridor or a cheetah runs for 12 steps; `code` says what to do.
 PROGRAM = f"""
 import os, signal, sys, time
 sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -67,10 +67,10 @@ def die(env=None):
 
 
 def kill(code, directory):
-    """Run a program, which kills itself, on a directory; return that."""
+    """Run a program that kills itself, and return its directory."""
     others = held_in(directory)
     run_python(PROGRAM + code, directory, status=-signal.SIGKILL)
-    # A child between fork and exec holds its parent's lock for a moment.
+    # Between fork and exec, a child briefly holds its parent's lock.
     wait_until(lambda: held_in(directory) <= others)
     return directory
 
@@ -81,26 +81,26 @@ def held_in(directory):
 
 @pytest.fixture(scope="module")
 def cut_off(tmp_path_factory):
-    """A run of two live episodes and 7 steps of a third, with provenance."""
+    """Return a run with two live episodes, 7 steps of a third, and provenance."""
     directory = tmp_path_factory.mktemp("cut") / "run"
     kill(
         "from mjrec.provenance import look_around\nenv = monitor()\nrun(env)\n"
         "look_around().found(wait=True)\nrun(env)\nrun(env, 7)\ndie(env)",
         directory,
     )
-    # The encoder outlives it for a moment, and a copy must not be of half a file.
+    # The encoder briefly outlives its process, and a half-written copy is useless.
     wait_until(lambda: not any(map(is_locked, directory.glob(".*.part"))))
     return directory
 
 
 @pytest.fixture
 def cut(cut_off, tmp_path):
-    """A copy of `cut_off`."""
+    """Return a copy of `cut_off`."""
     return Path(shutil.copytree(cut_off, tmp_path / "cut"))
 
 
 def results_of(directory):
-    """Return the results but for the names of the files they are from."""
+    """Return the results without the names of their source files."""
     results = mjrec.load_results(directory)
     assert results is not None
     del results["manifests"]
@@ -108,7 +108,7 @@ def results_of(directory):
 
 
 def assert_in_order(directory):
-    """Nothing is left to do, and no log or hidden file is there."""
+    """Check that nothing is left to do and no log or hidden file remains."""
     before = {path.name: path.read_bytes() for path in directory.iterdir()}
     again = mjrec.recover(directory)
     assert not again
@@ -122,7 +122,7 @@ def assert_in_order(directory):
 
 
 def test_a_live_video_is_whole_up_to_the_kill(cut):
-    """Every frame that its encoder was given is there, in order, with its hash."""
+    """Every frame that reached the encoder is there, in order, with its hash."""
     before = results_of(cut)
     recovery = mjrec.recover(cut)
     assert not recovery.failures, str(recovery)
@@ -144,7 +144,7 @@ def test_a_live_video_is_whole_up_to_the_kill(cut):
     }
     texts = [path.read_text().splitlines() for path in sorted(cut.glob("*.framehash"))]
     assert texts[2] == texts[1][: 9 + 8]
-    # All that is known of the run is there, its provenance too.
+    # Everything known about the run is there, including its provenance.
     assert stats_of(cut)["timestamps"] == [e["end_time"] for e in journal_of(cut)]
     manifest = manifest_of(cut)
     assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Corridor-v0"}
@@ -172,7 +172,7 @@ def test_a_live_video_is_whole_up_to_the_kill(cut):
 def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
     encoded, tmp_path
 ):
-    """The process was killed between the two. Without any frame no video is broken."""
+    """A video without frames is empty, not broken."""
     directory = kill(
         "import mjrec.formats.video_file as v\n"
         "write, count = v.FfmpegProcess.write, iter(range(9))\n"
@@ -199,7 +199,7 @@ def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
 
 
 def test_a_text_recording_that_was_cut_off_is_finished(tmp_path):
-    """It holds every frame, and the facts of a whole one."""
+    """The file has every frame, and the facts of a whole one."""
     directory = kill(
         "env = monitor(Corridor(12, 'ansi'))\nrun(env)\nrun(env, 7)\ndie()",
         tmp_path / "run",
@@ -217,7 +217,7 @@ def test_a_text_recording_that_was_cut_off_is_finished(tmp_path):
 
 
 def test_a_text_recording_without_metadata_gets_it(tmp_path):
-    """The process was killed when the file already had its final name."""
+    """The process was killed after the file got its final name."""
     directory = kill(
         "import mjrec.formats.video_sink as s\ns.write_metadata = lambda *_: die()"
         "\nenv = monitor(Corridor(12, 'ansi'))\nrun(env)",
@@ -235,14 +235,14 @@ def test_a_text_recording_without_metadata_gets_it(tmp_path):
     [
         ("", "encoding.temporary.write_bytes(b'ftyp' + bytes(900))", True),
         ("video_length=60", "encoding.temporary.write_bytes(b'')", True),
-        # No episode's end is taken for a clip's.
+        # The end of an episode must not be taken for the end of a clip.
         ("video_length=60", "encoding._hashes.truncate(0)", False),
     ],
 )
 def test_a_killed_encoder_is_reported(options, then, is_fed, tmp_path):
     """There is no video, its metadata says why, and its bytes are kept.
 
-    It is told apart from one that was given no frame.
+    An encoder that was given no frame is not reported as killed.
     """
     directory = kill(
         f"env = monitor({options})\nrun(env)\nrun(env, 7)\n"
@@ -265,7 +265,7 @@ def test_a_killed_encoder_is_reported(options, then, is_fed, tmp_path):
 
 
 def test_an_encoder_that_outlives_its_process_is_waited_for(tmp_path):
-    """As long as asked for, holding up no other, who reports it; then it is done."""
+    """A recovery with a short timeout reports a failure while another one waits."""
     directory = kill(
         "env = monitor()\nrun(env, 7)\npid = encoding(env)._process.pid\n"
         "os.kill(pid, signal.SIGSTOP)\nopen(sys.argv[1] + '.pid', 'w')"
@@ -293,7 +293,7 @@ def test_an_encoder_that_outlives_its_process_is_waited_for(tmp_path):
 
 
 def test_a_closed_monitors_logs_become_trajectories(tmp_path, halfcheetah):
-    """The rest stays; of a damaged manifest the journal makes another."""
+    """Pending videos stay, and the journal restores a damaged manifest."""
     monitor = mjrec.Monitor(halfcheetah, tmp_path, workers=0)
     monitor.reset(seed=0)
     monitor.step(monitor.action_space.sample())
@@ -313,7 +313,7 @@ def test_a_closed_monitors_logs_become_trajectories(tmp_path, halfcheetah):
 
 
 def test_a_killed_deferred_run_keeps_its_provenance(tmp_path):
-    """Packages and the policy's digest, through recovering and rendering."""
+    """The list of packages and the policy's digest survive recovery and rendering."""
     policy = tmp_path / "policy.pt"
     policy.write_bytes(b"weights")
     directory = kill(
@@ -341,7 +341,7 @@ def test_a_killed_deferred_run_keeps_its_provenance(tmp_path):
 
 
 def test_an_older_manifest_is_brought_up_to_date(tmp_path):
-    """Facts that nothing else knows stay."""
+    """Facts that no other file has are kept."""
     code = "env = monitor(write_upon_reset=True)\nrun(env)\nrun(env)\ndie()"
     directory = kill(code, tmp_path / "run")
     assert stats_of(directory)["episode_lengths"] == [12]
@@ -356,7 +356,7 @@ def test_an_older_manifest_is_brought_up_to_date(tmp_path):
 
 
 def test_a_log_of_unknown_rows_stays_and_is_reported(tmp_path):
-    """Of which no journal has a line; without rows it is removed."""
+    """A log that no journal mentions stays; one without rows is removed."""
     write_log(tmp_path, 0)
     [journal] = tmp_path.glob("*.jsonl")
     journal.write_bytes(b"")
@@ -377,7 +377,7 @@ def test_a_log_of_unknown_rows_stays_and_is_reported(tmp_path):
 
 
 def test_only_the_killed_monitors_files_are_touched(cut, corridor, play):
-    """A living one in the same directory goes on as if nothing had been."""
+    """A living monitor in the same directory is not disturbed."""
 
     def own(infix):
         return {p.name: p.read_bytes() for p in cut.iterdir() if infix in p.name}
@@ -385,7 +385,7 @@ def test_only_the_killed_monitors_files_are_touched(cut, corridor, play):
     with mjrec.Monitor(
         corridor, cut, lambda _: True, resume=True, env_id="Corridor-v0"
     ) as living:
-        # Resuming has recovered the dead one.
+        # Resuming has recovered the dead monitor.
         assert videos_in(cut) == [0, 1, 2]
         assert living.episode_id == 3
         play(living, 1)
@@ -401,7 +401,7 @@ def test_only_the_killed_monitors_files_are_touched(cut, corridor, play):
 
 
 def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path):
-    """Those of a living one stay; a note that was being rewritten is no note."""
+    """Files of a living renderer stay."""
     for number in (0, 1):
         write_log(tmp_path, number)
     mjrec.recover(tmp_path)
@@ -418,7 +418,7 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path):
     renderer = try_lock(tmp_path / f".{video_prefix(INFIX, 1)}.lock")
     assert renderer is not None
     drawn = Lock(side, "")
-    # This may be an open monitor's.
+    # This file may belong to an open monitor.
     model = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"
     model.touch()
     monitor = Lock(tmp_path / lock_name("1.7"), "")
@@ -428,7 +428,7 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path):
     assert all(part.exists() for part in [*living, side, model])
     renderer.release()
     drawn.let_go()
-    # As after a kill; it had recorded nothing.
+    # Release the lock like a killed monitor that had recorded nothing.
     monitor.let_go()
     mjrec.recover(tmp_path)
     assert not [p.name for p in [*living, side, model] if p.exists()]
@@ -436,7 +436,7 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path):
 
 
 def test_two_recoveries_at_once_do_the_work_once(cut):
-    """The second waits for the first, and finds nothing to do."""
+    """The second recovery waits for the first and finds nothing to do."""
     command = [sys.executable, "-m", "mjrec", "recover", str(cut)]
     both = [
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)
@@ -449,14 +449,14 @@ def test_two_recoveries_at_once_do_the_work_once(cut):
 
 
 def test_what_cannot_be_recovered_is_one_error(cut):
-    """No directory, one that cannot be written to, no timeout; nothing is half done."""
+    """Each bad directory or timeout is an error, and nothing is half done."""
     with pytest.raises(mjrec.InvalidArgument, match="not a directory"):
         mjrec.recover(cut / "missing")
     for wrong in (-1, float("nan"), "5", True):
         with pytest.raises(mjrec.InvalidArgument, match="timeout"):
             mjrec.recover(cut, timeout=wrong)
     before = sorted(cut.iterdir())
-    # For root, whom no permission stops, a directory stands where the lock belongs.
+    # Permissions do not stop root, so put a directory where the lock file belongs.
     blocker = cut / ".openaigym.recover.lock"
     blocker.mkdir()
     with pytest.raises(mjrec.DirectoryNotWritable, match=str(cut)):
@@ -466,7 +466,7 @@ def test_what_cannot_be_recovered_is_one_error(cut):
 
 
 def test_gyms_own_directories_are_left_alone(tmp_path):
-    """A manifest of gym's cannot be made again; HDF5 is not even loaded."""
+    """A gym manifest cannot be restored, so HDF5 is not even loaded."""
     names = [
         "openaigym.episode_batch.0.77.stats.json",
         "openaigym.video.0.77.video000000.meta.json",

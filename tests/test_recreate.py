@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which environments are recreated from a recording, and that nothing else runs."""
+"""Environments are recreated from a recording without running any other code."""
 
 import sys
 
@@ -23,13 +23,13 @@ PENDULUM = "InvertedPendulum-v5"
 
 
 def facts(env_id, *, framework="gymnasium", **said):
-    """Return what a recording says of its environment."""
+    """Return what a recording says about its environment."""
     known = {"framework": framework, "id": env_id, "kwargs": {}, "wrappers": []}
     return {**known, "max_episode_steps": None, **said}
 
 
 def refusal(said, *trust):
-    """Return why an environment is not made."""
+    """Return the reason why an environment is not recreated."""
     with pytest.raises(NotRecreated) as raised:
         recreate(said, trust=frozenset(trust))
     return str(raised.value)
@@ -37,12 +37,11 @@ def refusal(said, *trust):
 
 @pytest.fixture
 def pendulum():
-    """One of Gymnasium's own."""
+    """Return a recreated Gymnasium environment."""
     return recreate(facts(PENDULUM))
 
 
 def test_an_environment_is_made_with_its_arguments_limit_and_view():
-    """So that a recording of it says the same of it."""
     kwargs = {"frame_skip": 3, "render_mode": "rgb_array", "width": 32, "height": 24}
     env = recreate(facts(PENDULUM, kwargs=kwargs, max_episode_steps=2)).environment
     env.reset(seed=1)
@@ -54,7 +53,7 @@ def test_an_environment_is_made_with_its_arguments_limit_and_view():
 
 @pytest.mark.parametrize("limit", [None, 7, 5000])
 def test_the_recorded_limit_replaces_the_registered_one(limit):
-    """Whether it is none, lower or higher."""
+    """The recorded limit may be none, lower or higher."""
     made = recreate(facts("HalfCheetah-v5", max_episode_steps=limit)).environment
     assert made.spec.max_episode_steps == limit
 
@@ -64,14 +63,14 @@ def test_the_recorded_limit_replaces_the_registered_one(limit):
     ["subprocess:check_output", "os:system", f"../{PENDULUM}", "Nobody-v0", ""],
 )
 def test_other_ids_are_refused(env_id):
-    """Only ids of known packages are made, and the way out is named."""
+    """Only ids of known packages are accepted, and the error names the remedy."""
     reason = refusal(facts(env_id))
     assert reason.startswith("this would run code from the archive")
     assert f"--trust {env_id}" in reason
 
 
 def test_no_module_is_imported_for_an_id(tmp_path, monkeypatch):
-    """What a recording names is text, though it could be imported or resolved."""
+    """Names in a recording are text, even if they could be imported."""
     (tmp_path / "traps.py").write_text("raise SystemExit('it ran')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -90,7 +89,7 @@ def mine(**kwargs):
 
 
 def test_a_registered_id_is_made_where_the_reader_trusts_it(monkeypatch):
-    """With its exact name, or that of the module before it."""
+    """Trust requires the exact name, with or without its module."""
     monkeypatch.setattr(gymnasium.envs.registration, "registry", {**gymnasium.registry})
     gymnasium.register("Mine-v0", entry_point=f"{__name__}:mine")
     for trust in ("Mine-v0", "gymnasium:Mine-v0"):
@@ -101,7 +100,7 @@ def test_a_registered_id_is_made_where_the_reader_trusts_it(monkeypatch):
 
 CARTPOLE = {"framework": "dm_control", "env_id": "dm_control/cartpole-balance"}
 REFUSED = [
-    # Arguments name no files, hold no objects, and take no more than there is.
+    # Arguments must not name files, hold objects or be excessive.
     *(
         {"kwargs": kwargs}
         for kwargs in (
@@ -133,20 +132,20 @@ REFUSED = [
     {**CARTPOLE, "wrappers": ["a.B"]},
     {**CARTPOLE, "kwargs": {"random": 1}},
     {**CARTPOLE, "kwargs": {"task_kwargs": {"file": "x"}}},
-    # Its model is drawn from a seed that is not known.
+    # This task draws its model from an unknown seed.
     {**CARTPOLE, "env_id": "dm_control/lqr-lqr_2_1"},
 ]
 
 
 @pytest.mark.parametrize("said", REFUSED)
 def test_what_cannot_be_made_is_refused(said):
-    """With a reason, and no other error; what says nothing, too."""
+    """Facts without an environment are refused too."""
     refusal(facts(**{"env_id": PENDULUM, **said}))
     refusal({})
 
 
 def test_gymnasiums_own_wrappers_are_made_again():
-    """With their arguments, in their order."""
+    """Wrappers keep their arguments and order."""
     env = ClipAction(RescaleAction(gymnasium.make("HalfCheetah-v5"), -2, 2))
     again = recreate(facts("HalfCheetah-v5", **around_gymnasium(env))).environment
     assert isinstance(again, ClipAction)
@@ -158,7 +157,7 @@ def test_gymnasiums_own_wrappers_are_made_again():
 
 
 def test_of_other_wrappers_there_are_stand_ins():
-    """They step with recorded controls, and hand on what else is recorded."""
+    """A stand-in steps with recorded controls and returns recorded values."""
     recreated = recreate(facts("HalfCheetah-v5", wrappers=["a.B", "c.D"]))
     env, stand_in = recreated.environment, recreated.stand_in
     assert around_gymnasium(env)["wrappers"] == ["a.B", "c.D"]
@@ -188,14 +187,13 @@ def test_of_other_wrappers_there_are_stand_ins():
         {"bit_generator": "PCG64", "state": {"state": "x", "inc": 2}},
     ],
 )
-def test_a_random_state_that_is_none_is_a_reason(state, pendulum):
-    """Hostile random states end in a refusal."""
+def test_a_malformed_random_state_is_refused(state, pendulum):
     with pytest.raises(NotRecreated):
         pendulum.set_random_state(state)
 
 
 def test_a_random_state_leads_to_the_same_beginning(pendulum):
-    """As it was just before the reset. It has no seed, but dm_control's unused has."""
+    """The seed is unknown except for an unused dm_control generator."""
     pendulum.environment.reset(seed=3)
     before = pendulum.random_state()
     first = pendulum.environment.reset()[0]
@@ -207,7 +205,7 @@ def test_a_random_state_leads_to_the_same_beginning(pendulum):
 
 
 def test_steps_from_recorded_states_are_the_recorded_steps(pendulum, tmp_path):
-    """Bit for bit here; on another machine differences then do not grow."""
+    """Steps are equal bit for bit here; elsewhere, differences do not grow."""
     kept = {"video_callable": False, "trajectory_callable": True}
     with mjrec.Monitor(gymnasium.make(PENDULUM), tmp_path, **kept) as monitor:
         monitor.reset(seed=3)
@@ -221,20 +219,20 @@ def test_steps_from_recorded_states_are_the_recorded_steps(pendulum, tmp_path):
     unknown = np.full_like(states.view(np.float64), np.nan).view(states.dtype)
     for number, action in enumerate(actions):
         pendulum.put_into(states[number : number + 1])
-        # Of a state that nobody recorded nothing is known.
+        # An unknown state must not change the environment.
         pendulum.put_into(unknown[:1])
         _, reward, *_ = pendulum.environment.step(action)
         assert reward == rewards[number]
         data = pendulum.environment.unwrapped.data
         assert np.array_equal(data.qpos, states["qpos"][number + 1])
-    # Entered where no seed leads: the observation is that state's.
+    # No seed leads to this state, so the observation must be computed from it.
     state = states[2:3]
     expected = [*state["qpos"][0], *state["qvel"][0]]
     assert pendulum.enter(state, None).tolist() == expected
 
 
 def test_options_of_a_reset_are_plain():
-    """Options go to the reset only where they are numbers and words."""
+    """Only options made of numbers and words reach the reset."""
     assert checked_options(None) is None
     assert checked_options({"a": [1, 2]}) == {"a": [1, 2]}
     for options in ({"file": "x"}, {"a": "../x"}, {"a": {"path": 1}}, "no"):
@@ -244,7 +242,7 @@ def test_options_of_a_reset_are_plain():
 
 @pytest.mark.dm_control
 def test_a_task_of_the_suite_is_made_again():
-    """With its arguments; and the seed of its generator is known from its state."""
+    """Its arguments are kept, and its generator's state reveals the seed."""
     pytest.importorskip("dm_control.suite")
     kwargs = {"task_kwargs": {"random": 5, "time_limit": 0.2}}
     said = facts("dm_control/cartpole-balance", framework="dm_control", kwargs=kwargs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find, merge, list and clear results, as gym does."""
+"""Find, merge, list and clear results like gym."""
 
 import tracemalloc
 from pathlib import Path
@@ -50,12 +50,12 @@ def test_names_give_monitor_and_episode():
         is_shared = ".model." in name or ".render." in name or name in OTHER_FILES
         assert infix_of(name) == (None if is_shared else "0.1"), name
         assert episode_of(name) == (27 if "000027" in name else None), name
-    # Exists only inside logs.
+    # This name exists only inside logs.
     assert infix_of("openaigym.clip.0.1.step000000137.part000000") == "0.1"
 
 
 def test_detection_takes_exact_names_in_order(tmp_path):
-    """Links to files count, folders do not; `files` replaces listing the directory."""
+    """Links to files count, folders do not, and `files` replaces the listing."""
     assert mjrec.detect_monitor_files(str(tmp_path / "missing")) == []
     touch(tmp_path, *MONITOR_FILES, *HIDDEN_FILES, *OTHER_FILES)
     (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
@@ -76,7 +76,7 @@ def test_detection_takes_exact_names_in_order(tmp_path):
 
 
 def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
-    """Manifest and journal first; links instead of targets; nothing while in use."""
+    """Manifest and journal go first, links keep their targets, and locks prevent it."""
     touch(tmp_path, *MONITOR_FILES[:-1], *HIDDEN_FILES[1:], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
@@ -86,7 +86,7 @@ def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
     with pytest.raises(DirectoryInUse, match=r"\.openaigym\.0\.1\.lock"):
         mjrec.clear_monitor_files(tmp_path)
     assert set(tmp_path.iterdir()) == before
-    lock.let_go()  # as a killed process does
+    lock.let_go()  # This leaves the lock file, like a killed process.
     removed, real = [], Path.unlink
     monkeypatch.setattr(
         Path, "unlink", lambda p, **rest: (removed.append(p.name), real(p, **rest))
@@ -99,11 +99,11 @@ def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
 
 
 def test_merge_sorts_episodes_by_time(tmp_path):
-    """The sort is stable; each row keeps its length, reward, type and source."""
+    """The sort is stable, and each row keeps its length, reward, type and source."""
     write_saved(tmp_path, "0.7", 1, 4, start=0.5, types="te")
-    # gym notes a type at each reset, hence more types than episodes.
+    # Gym notes a type at each reset, so there are more types than episodes.
     write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="ette")
-    write_saved(tmp_path, "2.7", 5, types=None)  # means training
+    write_saved(tmp_path, "2.7", 5, types=None)  # This means training.
     paths = sorted(tmp_path.glob("*.stats.json"))
     assert mjrec.merge_stats_files(paths) == (
         [0, 1, 1, 0, 2],
@@ -178,7 +178,7 @@ def video(directory, infix, episode_id, suffix):
 
 
 def test_journal_episode_has_its_facts_and_files(tmp_path):
-    """The journal says more than statistics; another monitor's video is not taken."""
+    """The journal says more than statistics, and other monitors' videos are ignored."""
     facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
     write_journal(tmp_path, "0.7", entry(27, **facts), 28)
     write_saved(tmp_path, "0.7", 27, 28)
@@ -194,7 +194,7 @@ def test_journal_episode_has_its_facts_and_files(tmp_path):
 
 @pytest.mark.parametrize("has_journal", [True, False])
 def test_pending_videos_are_deferred_and_missing(tmp_path, has_journal):
-    """An episode with metadata but no video failed."""
+    """An episode with metadata but no video has failed."""
     pending = []
     if has_journal:
         kinds = ["deferred"] * 4 + ["live"]
@@ -227,7 +227,7 @@ def test_gym_episodes_have_gym_facts_only(tmp_path):
     ("types", "linked"), [(None, True), ("ttt", True), ("tttt", False)]
 )
 def test_ambiguous_gym_video_is_left_out(tmp_path, types, linked):
-    """Gym numbers videos by resets, which may be more than its episodes."""
+    """Gym numbers videos by resets, which may outnumber episodes."""
     write_saved(tmp_path, "0.7", 1, 2, types=types)
     video(tmp_path, "0.7", 0, ".mp4")
     first, second = mjrec.iter_episodes(tmp_path)
@@ -246,7 +246,7 @@ def test_monitors_are_sorted_by_number(tmp_path):
 
 
 def peak_memory(read, path):
-    """Return the peak of bytes allocated by a second reading."""
+    """Return the peak number of bytes allocated by a second reading."""
     read(path)
     tracemalloc.start()
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of evaluation results, and errors of damaged ones."""
+"""Read and write files of evaluation results, and report damaged ones."""
 
 import dataclasses
 import json
@@ -84,7 +84,7 @@ def files_of(result):
 
 
 def test_results_are_read_back(tmp_path):
-    """Floats stay equal bit for bit; times may be missing."""
+    """Floats are equal bit for bit, and times may be missing."""
     read = read_results(write(tmp_path))
     assert read.plan == PLAN
     assert (read.summaries, read.across) == ((SUMMARY,), ACROSS)
@@ -119,7 +119,7 @@ def test_files_match_the_documentation(tmp_path):
 
 
 def test_results_are_removed_while_rewritten(tmp_path):
-    """Old tables never stand beside a new plan; the error says how to resume."""
+    """Old tables never coexist with a new plan, and the error says how to resume."""
     with pytest.raises(UnreadableFile, match="the directory contains no evaluation"):
         read_results(tmp_path)
     assert not is_evaluation(tmp_path)
@@ -171,7 +171,7 @@ def test_damage_is_an_error_that_names_the_file(tmp_path, damage):
     path.write_bytes(data.replace(good, bad, 1))
     with pytest.raises(UnreadableFile) as caught:
         read_results(tmp_path)
-    # A plan that does not fit the table may blame the table.
+    # The error may blame the table if the plan does not match it.
     assert caught.value.path.name in {name, "results.csv"}
 
 

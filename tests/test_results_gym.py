@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of real gym versions are read, and real gym 0.21 reads ours.
+"""Read files of real gym versions, and let real gym 0.21 read ours.
 
 `legacy/record_gym.py` recorded `data/gym/<version>/<case>/` with that version.
 `data/gym/answers.json` has the results of gym's own `load_results` for them and for
@@ -23,7 +23,7 @@ DATA = TESTS / "data" / "gym"
 VERSIONS = ["0.7.4", "0.9.6", "0.12.1", "0.17.3", "0.19.0", "0.21.0", "0.22.0"]
 NAN, INF = math.nan, math.inf
 
-# Lengths, rewards and types in each case.
+# Each case has its lengths, rewards and types.
 PLAYED = {
     "plain": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
     "text": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
@@ -32,7 +32,7 @@ PLAYED = {
     "unfinished": ([3, 1], [4.5, -2.0], "ee"),
     "empty": ([], [], None),
     "two_monitors": ([3, 3, 1, 1], [4.5, 4.5, -2.0, -2.0], "tete"),
-    # Played as "tee"; gym wrote "tteee", one for each reset.
+    # This case was played as "tee", but gym wrote one type for each reset.
     "resets_in_a_row": ([3, 1, 2], [4.5, -2.0, 0.5], "tte"),
 }
 RECORDED = [f"{version}/{case}" for version in sorted(VERSIONS) for case in PLAYED]
@@ -40,7 +40,7 @@ ENV_INFO = {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
 
 
 def write_ours(directory):
-    """Write two monitors with videos, our own key, and infinity."""
+    """Write two monitors with videos, a key of our own, and infinity."""
     directory.mkdir()
     for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
         video = f"openaigym.video.{name}.video000000"
@@ -70,13 +70,13 @@ def assert_same(ours, gyms, *, but=()):
     """Compare all keys except those in `but`."""
     assert list(ours) == list(gyms)
     for key in [key for key in ours if key not in but]:
-        # The text of NaN equals itself.
+        # NaN does not equal itself, but its text does.
         assert repr(ours[key]) == repr(gyms[key]), key
 
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_directories_of_gym_are_read(name, monkeypatch):
-    """Results equal gym's, except for known errors of gym."""
+    """Results equal gym's except for known errors in gym."""
     monkeypatch.chdir(DATA)
     version, _, case = name.partition("/")
     ours, gyms = mjrec.load_results(Path(name)), recorded_answer(name)
@@ -92,7 +92,7 @@ def test_directories_of_gym_are_read(name, monkeypatch):
             assert "missing expected key env_id" in gyms["error"]
             assert ours["env_info"] == {"gym_version": version}
         case "two_monitors":
-            # gym lists no start for the idle monitor and shifts the types.
+            # Gym lists no start for the idle monitor and shifts the types.
             but = ("initial_reset_timestamps", "episode_types")
             assert_same(ours, gyms, but=but)
             starts = ours["initial_reset_timestamps"]
@@ -131,10 +131,10 @@ def test_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
 
 @pytest.fixture
 def ask_gym():
-    """Return a function that asks the `load_results` of gym 0.21.0."""
+    """Return a function that calls `load_results` of gym 0.21.0."""
     if "MJREC_TEST_GYM" not in os.environ:
         pytest.skip("no environment with gym 0.21.0: scripts/test --all makes one")
-    # gym may warn.
+    # Gym must be free to warn.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
 
     def ask(*directories):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of monitors that never closed."""
+"""Read the results of monitors that never closed."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ READERS = (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path)))
 
 @pytest.fixture
 def late(tmp_path):
-    """Files of a monitor killed after episode 5; its manifest has 4, and one video."""
+    """Return files of a monitor killed after episode 5, with an older manifest."""
     names = map(VIDEO.format, (0, 4))
     videos = [(name, name.replace("mp4", "meta.json")) for name in names]
     for mp4, metadata in videos:
@@ -31,7 +31,7 @@ def late(tmp_path):
 
 
 def load(directory):
-    """Load results, and compare them with the episodes."""
+    """Load results and compare them with the episodes."""
     results = mjrec.load_results(directory)
     episodes = list(mjrec.iter_episodes(directory))
     assert [each.length for each in episodes] == results["episode_lengths"]
@@ -70,7 +70,7 @@ def test_journal_alone_gives_results(tmp_path, caplog):
 
 
 def test_journal_completes_an_older_manifest(late):
-    """Finished videos are found, broken ones are not."""
+    """Finished videos are found, but broken ones are not."""
     manifest = only(late, "*.manifest.json")
     results = load(late)
     assert results["timestamps"] == [100, 101, 102, 103, 104]
@@ -88,7 +88,7 @@ def test_journal_completes_an_older_manifest(late):
 def test_open_and_resumed_monitors_are_merged_with_killed_ones(
     late, make_corridor, play
 ):
-    """Each counts once, in one numbering."""
+    """Each episode counts once, with consecutive numbers."""
     options = {"resume": True, "video_callable": False}
     with mjrec.Monitor(make_corridor(2), late, **options) as env:
         play(env, 2)
@@ -107,7 +107,7 @@ def test_open_and_resumed_monitors_are_merged_with_killed_ones(
     ("journal", "count"), [((3, 4), 3), ((4, 5, 6), 3), ((1, 2, 3, 4), 4)]
 )
 def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
-    """The statistics file wins a tie; duplicate lines do not count."""
+    """The statistics file wins a tie, and duplicate lines do not count."""
     write_saved(tmp_path, "0.7", 1, 2, 3)
     write_journal(tmp_path, "0.7", *journal, *journal[-1:] * 4)
     results = mjrec.load_results(tmp_path)
@@ -117,7 +117,7 @@ def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
 
 @pytest.mark.parametrize("lock", ["dead", "link", "", "[1]"])
 def test_journal_or_lock_names_the_environment(tmp_path, lock, caplog):
-    """Unknown facts give no warning; a link in place of a lock is not read."""
+    """Unknown facts cause no warning, and a link in place of a lock is not read."""
     write_journal(tmp_path, "0.7", 1)
     path = tmp_path / ".openaigym.0.7.lock"
     content = json.dumps({"run": {"env_info": ENV_INFO}})
@@ -136,7 +136,7 @@ def test_journal_or_lock_names_the_environment(tmp_path, lock, caplog):
 @pytest.mark.parametrize("pattern", ["*.manifest.json", "*.stats.json"])
 @pytest.mark.parametrize("content", [None, b"{", b'{"stats": "../x"}'])
 def test_journal_replaces_damaged_files(tmp_path, pattern, content, caplog):
-    """A warning names the file; without a journal it is an error."""
+    """A warning names the file; without a journal there is an error."""
     write_saved(tmp_path, "0.7", 1, 2)
     journal = write_journal(tmp_path, "0.7", 1, 2, run={"env_info": ENV_INFO})
     damaged = only(tmp_path, pattern)
@@ -145,7 +145,7 @@ def test_journal_replaces_damaged_files(tmp_path, pattern, content, caplog):
     else:
         damaged.write_bytes(content)
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    # A killed monitor has no manifest.
+    # A missing manifest is normal after a kill.
     if content is not None or "stats" in pattern:
         assert [damaged.name in r.getMessage() for r in caplog.records] == [True] * 2
         journal.unlink()
@@ -175,7 +175,7 @@ def test_statistics_replace_a_damaged_journal(tmp_path, caplog):
 
 @pytest.mark.parametrize("lost", [0, 3])
 def test_lost_journal_line_costs_only_its_details(tmp_path, lost):
-    """Statistics have the episode; its neighbors give its number."""
+    """Statistics still have the episode, and its neighbors give its number."""
     details = {"first_episode_id": 5, "next_episode_id": 9}
     write_saved(tmp_path, "0.7", 5, 6, 7, 8, details=details)
     journal = write_journal(tmp_path, "0.7", 5, 6, 7, 8)
@@ -193,9 +193,9 @@ def test_lost_journal_line_costs_only_its_details(tmp_path, lost):
 @pytest.mark.parametrize(
     ("saved", "journal", "following", "numbers", "shown"),
     [
-        # Episode 6 or 7 was reset early; no file says which.
+        # Episode 6 or 7 was reset early, and no file says which.
         ((5, 7, 8), (5, 8), 9, [5, 6, 8], [True, False, True]),
-        # The journal is lost; all numbers were completed, or not all.
+        # Without a journal, the numbers show whether all episodes were completed.
         ((5, 6), (), 7, [5, 6], [True, True]),
         ((5, 6), (), 8, [5, 6], [False, False]),
     ],

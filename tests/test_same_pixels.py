@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames drawn from recorded states equal those of `render()`, byte for byte."""
+"""Frames rendered from recorded states equal those of `render()`, byte for byte."""
 
 import contextlib
 import copy
@@ -56,14 +56,14 @@ def workers():
 
 
 def check_frames(directory, live, workers, *, is_seen_to_move=True):
-    """Check that drawn frames equal live frames."""
+    """Check that rendered frames equal live frames."""
     paths = {*directory.glob("*.h5"), *in_flight(directory)}
     for episode, frames in enumerate(live):
         [path] = [p for p in paths if p.name.endswith(f".episode{episode:06d}.h5")]
         for pool in workers[: 1 if episode else None]:
             drawn = list(pool.frames(path, range(len(frames))))
             np.testing.assert_array_equal(drawn, frames)
-    assert live[0][0].std() > 3  # not blank
+    assert live[0][0].std() > 3  # A blank frame would not vary.
     if is_seen_to_move:
         assert len({frame.tobytes() for frames in live for frame in frames}) > len(live)
 
@@ -74,8 +74,8 @@ def monitored(env, directory, **options):
 
 
 def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
-    """Record two episodes, and return all frames."""
-    # MuJoCo frees a viewer in the current context: collect those of earlier tests now.
+    """Record two episodes and return all frames."""
+    # MuJoCo frees a viewer in the current context, so collect earlier viewers now.
     gc.collect()
     with monitored(env, directory, **options) as monitor:
         frame = frame or monitor.render
@@ -85,7 +85,7 @@ def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
 
 
 def episodes(env, wrapped, look, each_step=lambda _: None):
-    """Play two episodes; yield each one's results of `look`."""
+    """Play two episodes and yield the results of `look` for each."""
     random = np.random.RandomState(1)
     is_gymnasium = hasattr(env, "unwrapped")
     space = env.action_space if is_gymnasium else env.action_spec()
@@ -98,7 +98,7 @@ def episodes(env, wrapped, look, each_step=lambda _: None):
             each_step(step)
             outcome = wrapped.step(random.uniform(low, high, space.shape))
             seen.append(look(outcome))
-            # A dm_env's discount is 1 while the episode goes on.
+            # The discount of a dm_env episode is 1 until it ends.
             if is_gymnasium and any(outcome[2:4]):
                 break
         yield seen
@@ -116,7 +116,7 @@ def make(env_id, **kwargs):
 
 
 def test_full_quality(workers, tmp_path):
-    """With Gymnasium's shadows and antialiasing, which the other tests reduce."""
+    """Use Gymnasium's shadows and antialiasing, which the other tests reduce."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array")
     live = record(gymnasium.wrappers.TimeLimit(env, 2), tmp_path)
     check_frames(tmp_path, live, workers[:1])
@@ -129,7 +129,7 @@ def test_gymnasium(env_id, workers, tmp_path):
 
 @parametrize_environments("env_id", GYMNASIUM, "Hopper-v5")
 def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
-    """The environment or the monitor names the camera."""
+    """Either the environment or the monitor names the camera."""
     model = gymnasium.make(env_id).unwrapped
     for number in range(model.model.ncam):
         name = model.model.camera(number).name
@@ -144,7 +144,7 @@ def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
 
 def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
     """The viewer changes within an episode."""
-    monkeypatch.chdir(tmp_path)  # for MuJoCo's log of full scenes
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs full scenes in the working directory.
     env = make(
         "Ant-v5",
         max_geom=12,
@@ -164,7 +164,7 @@ def test_camera_and_visual_options_of_the_user(workers, tmp_path, monkeypatch):
     "env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5"
 )
 def test_robotics(env_id, workers, tmp_path):
-    """Also where each `render` moves goals."""
+    """Some of these environments move goals in `render`."""
     with robots_that_reset():
         live = record(make(env_id), tmp_path)
     # The ant is too small to see in large mazes.
@@ -187,7 +187,7 @@ def record_dm(env, directory, camera):
     ("quadruped", "escape", False),
 )
 def test_suite(domain, task, visualize_reward, workers, tmp_path):
-    """Each task from each camera; `visualize_reward` changes colors."""
+    """Each task is rendered from each camera; `visualize_reward` changes colors."""
     from dm_control import suite
 
     options = {"task_kwargs": {"random": 5}, "visualize_reward": visualize_reward}
@@ -201,7 +201,7 @@ def test_suite(domain, task, visualize_reward, workers, tmp_path):
 
 
 def composer_environments():
-    """Return constructors by name, without soccer, which has a reward per player."""
+    """Return constructors by name, except soccer, which has a reward per player."""
     if not has_dm_control:
         return {}
     from dm_control import manipulation
@@ -227,7 +227,7 @@ def composer_environments():
     ("reach_site_features", None),
 )
 def test_composer(name, camera, workers, tmp_path):
-    """Such tasks compile a new model for each episode."""
+    """Composer tasks compile a new model for each episode."""
     live = record_dm(composer_environments()[name](), tmp_path, camera)
     check_frames(tmp_path, live, workers[:1])
 
@@ -242,7 +242,7 @@ def own_environment(name):
 
 @pytest.mark.parametrize("name", ["walker_on_plane", "showcase"])
 def test_own_model(name, workers, tmp_path):
-    """An infinite plane is drawn around the previous frame's camera."""
+    """An infinite plane is centered on the camera of the previous frame."""
     check_frames(tmp_path, record(own_environment(name), tmp_path), workers)
 
 
@@ -274,7 +274,7 @@ class Negative(InvertedPendulumEnv):
     ],
 )
 def test_overridden_render_is_recorded_live(kind, mode, named, tmp_path):
-    """`render="deferred"` is an error; metadata names the reason."""
+    """`render="deferred"` is an error, and metadata names the reason."""
     env = kind(render_mode=mode, **SIZE)
     with pytest.raises(mjrec.PicturesDiffer) as error:
         mjrec.Monitor(env, tmp_path / "out", render="deferred")
@@ -304,7 +304,7 @@ POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
 def test_frames_that_states_cannot_give_are_drawn_live(
     options, arrays, reason, tmp_path, monkeypatch, caplog
 ):
-    """The log names the reason; `render="deferred"` is an error."""
+    """The log names the reason, and `render="deferred"` is an error."""
     if arrays:
         monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", arrays)
     env = make("InvertedPendulum-v5", **options)
@@ -356,7 +356,7 @@ QUADRUPED = pytest.param("quadruped-escape", marks=pytest.mark.dm_control)
     *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1", QUADRUPED),
 )
 def test_recording_disturbs_nothing(name, tmp_path):
-    """States and random numbers stay equal bit for bit; no viewer is made."""
+    """States and random numbers stay bit-identical, and no viewer is created."""
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def run(wrap):

@@ -65,7 +65,7 @@ def mapped(request, monkeypatch):
 
 
 def test_counted_rows_are_readable_at_once(logs, path, mapped):
-    """An open reader keeps its rows; closing leaves only the log."""
+    """An open reader keeps its rows, and closing leaves only the log."""
     span = write(logs, 2)
     journal, log, tail, _ = files_of(path.parent)
     assert tail.exists() == mapped
@@ -83,7 +83,7 @@ def test_counted_rows_are_readable_at_once(logs, path, mapped):
 
 
 def test_one_log_returns_several_recordings_bit_for_bit(logs, tmp_path):
-    """Each has its own rows and facts, whether it ended or not."""
+    """Each has its own rows and facts, whether or not it ended."""
     lengths = [3, 0, 17, 40, 2]
     facts = [{**FACTS, "number": 0}, {"number": 1}, {}, {**FACTS, "seed": 8}, FACTS]
     for number, steps in enumerate(lengths):
@@ -122,7 +122,7 @@ def test_model_changes_belong_to_counted_rows(logs, path):
 
 
 def test_reader_sees_whole_recordings_beside_a_writer(tmp_path):
-    """The tail wraps with every fourth row."""
+    """The tail wraps every four rows."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record():
@@ -166,7 +166,7 @@ def test_reader_sees_whole_recordings_beside_a_writer(tmp_path):
 
 
 def die_writing(function, part, number=1):
-    """Let the Nth call of `os.write` or `os.pwrite` write a part and die."""
+    """Make the Nth call of `os.write` or `os.pwrite` write a part and die."""
     real, calls = getattr(os, function), itertools.count(1)
 
     def write_part(descriptor, data, *offset):
@@ -194,10 +194,10 @@ MOMENTS = {
         3 * CAPACITY,
         lambda _: die_writing("pwrite", lambda data: data[: len(data) // 2 - 3]),
     ),
-    # The tail is in the log, which is not noted yet.
+    # The log has the tail's rows, but this has not been noted yet.
     "after a write": (3 * CAPACITY, lambda _: die_writing("pwrite", bytes)),
     "refilling the first slot": (3 * CAPACITY, die_in_slot),
-    # All rows are in the log; the tail still exists.
+    # All rows are in the log, and the tail still exists.
     "in close": (3 * CAPACITY + 2, die_in_close),
 }
 
@@ -269,7 +269,7 @@ def test_death_in_a_journal_line_loses_only_that_line(logs, tmp_path, line, part
             content = read(found[name])
             check(content, 5)
             assert ("complete" in content.facts) == (f"end {number}" in written)
-    # A recovery appends to that journal, which completes a line without a newline.
+    # Recovery appends to that journal and completes a line without a newline.
     for each in found.values():
         add_facts(each, {"later": 1})
         assert read(each).facts["later"] == 1
@@ -281,7 +281,7 @@ def test_death_in_a_journal_line_loses_only_that_line(logs, tmp_path, line, part
 
 
 def test_truncated_log_reports_lost_rows(logs, path):
-    """Other rows in their place are an error."""
+    """If other rows replace them, reading is an error."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -305,7 +305,7 @@ BAD_TAILS = {
     "other row size": lambda *_: tail_head(19, ROW // 8 + 1, CAPACITY),
     "too many rows": lambda *_: tail_head(19, ROW // 8, CAPACITY + 1),
     "no rows": lambda *_: tail_head(19, ROW // 8, 0),
-    # Pages that are older than the log, or were never written.
+    # These pages are older than the log or were never written.
     "zeros": lambda _, newer: bytes(len(newer)),
     "older": lambda older, _: older,
     "zeros behind the head": lambda _, newer: newer[:4096].ljust(len(newer), b"\0"),
@@ -324,7 +324,7 @@ def test_stale_or_foreign_tail_adds_no_row(logs, path, tail):
     write(logs, 18, first=13, span=span)
     newer = file.read_bytes()
     logs.release()
-    # The log has rows 0 to 15, the tail those from 16 on.
+    # The log has rows 0 to 15, and the tail has the rest.
     file.write_bytes(BAD_TAILS[tail](older, newer))
     content = read(path)
     check(content, 15)
@@ -343,7 +343,7 @@ def test_full_disk_when_a_log_begins_leaves_nothing(logs, path):
 
 @pytest.mark.parametrize("room", [0, 30])
 def test_journal_lines_wait_for_room_on_a_full_disk(logs, path, room):
-    """The journal stays as it was; an end may follow the next beginning."""
+    """The journal stays intact, and an end may follow the next beginning."""
     span = write(logs, 3)
     journal, *_ = files_of(path.parent)
     before = journal.read_bytes()
@@ -401,7 +401,7 @@ def test_model_change_can_be_added_again_after_a_full_disk(logs, path):
 
 
 def test_new_log_begins_for_other_rows_and_long_logs(logs, tmp_path, monkeypatch):
-    """Each recording that may be deleted alone has its own log."""
+    """A recording that may be deleted alone also gets its own log."""
     other = row_dtype(state=STATE, action=np.dtype(("<i4", ACTION.shape)))
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
     write(logs, 5, episode=0)
@@ -424,7 +424,7 @@ def test_new_log_begins_for_other_rows_and_long_logs(logs, tmp_path, monkeypatch
 
 
 def test_log_is_removed_after_its_last_recording(logs, tmp_path):
-    """A recording is done when it is dropped, has its file or has its video."""
+    """A recording is done once dropped, or once its file or video exists."""
     write(logs, 3, episode=0).log.add_change(model_change(4))
     video = {"kept": False, "video": {"name": "v.mp4"}}
     paths = [episode(tmp_path, number) for number in range(4)]
@@ -508,7 +508,7 @@ def test_rows_without_a_readable_journal_stay(logs, path, old, new, reason):
 
 
 def test_removing_open_files_costs_one_recording(logs, tmp_path):
-    """The next recording begins another log and a complete journal."""
+    """The next recording starts another log and a complete journal."""
     write(logs, 3, episode=0)
     for file in files_of(tmp_path):
         file.unlink(missing_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished trajectories, alone or bundled, hold the content of their log."""
+"""Finished trajectories, alone or bundled, have the content of their log."""
 
 import json
 import math
@@ -93,7 +93,7 @@ def check_changes(content):
     [
         (40, 2, DTYPE),
         (0, 1, DTYPE),
-        (700, 1, DTYPE),  # several chunks in each dataset
+        (700, 1, DTYPE),  # Each dataset has several chunks.
         (3, 2, row_dtype()),
         (3, 2, row_dtype(state=STATE, action=np.dtype("<i8"))),
         (3, 2, row_dtype(action=np.dtype(("<f8", (0,))))),
@@ -123,13 +123,13 @@ def test_killed_episode_records_its_reason(path):
         assert content.facts == {**FACTS, "complete": False, **facts}
         assert len(content.states) == steps + 1
         path.unlink()
-    # As the monitor adds at each step; Python 3.12's `sum` differs.
+    # The monitor adds up step by step, unlike `sum` since Python 3.12.
     assert added_up([1e16, 1.0, -1e16]) == 0.0
     assert math.copysign(1, added_up([-0.0])) == 1
 
 
 def test_h5py_reads_every_array_by_name(path):
-    """The file has HDF5 1.10's format and only built-in filters."""
+    """The file uses HDF5 1.10's format and only built-in filters."""
     record(path)
     content = read(path)
     finish_trajectory(path)
@@ -152,7 +152,7 @@ def test_h5py_reads_every_array_by_name(path):
             count = properties.get_nfilters()
             filters = [properties.get_filter(i)[0] for i in range(count)]
             assert filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
-    assert path.read_bytes()[8] == 3  # superblock of HDF5 1.10
+    assert path.read_bytes()[8] == 3  # This is the superblock version of HDF5 1.10.
 
 
 def test_examples_of_the_trajectory_reference_run(path, monkeypatch, capsys):
@@ -203,7 +203,7 @@ def test_full_disk_leaves_only_the_log(path):
 
 
 def test_missing_or_damaged_log_is_an_error(path):
-    """A damaged journal hides the log, which stays."""
+    """A damaged journal hides the log, which is kept."""
     with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor its log"):
         finish_trajectory(path)
     record(path)
@@ -230,7 +230,7 @@ def test_memory_does_not_grow_with_the_episode(path):
 
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_leaves_only_the_log(path, monkeypatch):
-    """An exception inside a callback of HDF5 would crash."""
+    """An exception inside an HDF5 callback would crash the process."""
     record(path, 600, dtype=LONG)
     usual = trajectory_hdf5._Unfailing.write
 
@@ -280,7 +280,7 @@ def test_bundle_equals_single_files(tmp_path):
 
 
 def test_bundle_takes_more_episodes_and_new_facts(tmp_path):
-    """Earlier episodes stay bit for bit; on a full disk the log stays."""
+    """Earlier episodes stay bit-identical, and a full disk keeps the log."""
     paths = record_several(tmp_path, 20, 300, 301)
     assert bundle_trajectories(paths[:1]) == {}
     bundle = bundle_of(paths[0])
@@ -301,7 +301,7 @@ def test_bundle_takes_more_episodes_and_new_facts(tmp_path):
 
 
 def test_directory_lists_bundled_trajectories(tmp_path):
-    """A bundle itself is not a trajectory; its error names one that is."""
+    """A bundle is not itself a trajectory, so its error names one inside."""
     own, *others = record_several(tmp_path, 1, 2, 3)
     finish_trajectory(own)
     bundle_trajectories([own, *others])
@@ -348,7 +348,7 @@ def test_invalid_bundle_index_names_no_episode(tmp_path, kind, episodes):
 
 @pytest.mark.parametrize("is_written", [False, True])
 def test_recovery_bundles_a_killed_run(tmp_path, monkeypatch, is_written):
-    """The kill may fall between writing the bundle and removing the logs."""
+    """The process may die between writing the bundle and removing the logs."""
     paths = record_several(tmp_path, 4, 5)
     if is_written:
         with monkeypatch.context() as patched:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors of vector environments."""
+"""Monitors record vector environments."""
 
 import contextlib
 import functools
@@ -64,7 +64,7 @@ def pendulums(count):
 @pytest.mark.parametrize("kind", ["sync", "one object", "async"])
 @pytest.mark.parametrize("mode", MODES)
 def test_each_sub_environment_has_whole_videos(corridors, tmp_path, caplog, kind, mode):
-    """Where a reset hides the terminal frame, metadata and one warning say so."""
+    """Metadata and one warning say when a reset hides the terminal frame."""
     is_hidden = kind != "sync" and mode == SAME_STEP
     with mjrec.Monitor(corridors(mode, kind=kind), tmp_path) as env:
         play(env, 8, seed=8)
@@ -84,7 +84,7 @@ def test_each_sub_environment_has_whole_videos(corridors, tmp_path, caplog, kind
 
 # Takes more than five seconds: 64 videos.
 def test_sixty_four_sub_environments(tmp_path):
-    """Each has its trajectory and video; their log tails share 4 MiB."""
+    """Each has a trajectory and a video, and their log tails share 4 MiB."""
     with mjrec.Monitor(pendulums(64), tmp_path, workers=2, quality="draft") as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
@@ -116,7 +116,7 @@ def test_each_monitor_reports_its_own_failures(tmp_path):
 
 
 def test_close_restores_the_sub_environments(corridors, tmp_path):
-    """Each is closed once; until then calls reach them through their monitors."""
+    """Each closes once; until then, calls reach it through its monitor."""
     vector = corridors()
     originals = list(vector.envs)
     scaled = TransformReward(vector, lambda rewards: 10 * rewards)
@@ -134,7 +134,7 @@ def test_close_restores_the_sub_environments(corridors, tmp_path):
         assert [each.closed for each in originals] == [1, 1]
         env.reset()
         env.step(np.array([0, 0]))
-    # Monitors record rewards below vector wrappers, and nothing after close.
+    # Monitors record rewards before vector wrappers change them, until they close.
     assert env.get_episode_rewards() == [[1.0], []]
     assert [m.stats_recorder.episode_types for m in env.monitors] == [["e"], []]
     prefixes = [monitor._options.name_prefix for monitor in env.monitors]
@@ -143,7 +143,7 @@ def test_close_restores_the_sub_environments(corridors, tmp_path):
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_failing_constructor_leaves_no_files(make_corridor, tmp_path, names, resume):
-    """The last sub-environment has no frames."""
+    """The constructor fails because the last sub-environment has no frames."""
     target = tmp_path / "a" / "b"
     if resume:
         mjrec.Monitor(make_corridor(), target).close()
@@ -159,7 +159,7 @@ def test_failing_constructor_leaves_no_files(make_corridor, tmp_path, names, res
 
 @pytest.mark.parametrize("kind", ["sync", "one object"])
 def test_error_is_noted_in_all_running_episodes(corridors, tmp_path, kind):
-    """Steps before reset and pickling are errors as well."""
+    """Stepping before a reset and pickling are errors as well."""
     vector = corridors(kind=kind)
 
     def explode(action):
@@ -196,13 +196,13 @@ def test_render_is_called_once_a_step_and_only_for_videos(tmp_path):
         assert vector.rendered == 4
         for _ in range(8):
             env.step(np.array([0, 0]))
-        env.close(reason="done")  # passed on to the environment
+        env.close(reason="done")  # This argument reaches the environment.
     assert vector.rendered == 4
     assert vector.closings == [{"reason": "done"}]
 
 
 def test_trajectories_hold_actions_rewards_and_observations(tmp_path):
-    """The last observation is the episode's own."""
+    """The last observation is the terminal one, not that of the next reset."""
     vector = VectorCorridor(LENGTHS, SAME_STEP)
     options = {"mode": "evaluation", "observations": True}
     with mjrec.Monitor(vector, tmp_path, False, **options) as env:
@@ -235,7 +235,7 @@ def test_statistics_and_episode_info_equal_those_of_gymnasium(tmp_path, mode):
             assert list(info["episode"][name]) == list(expected["episode"][name])
         assert list(info["_episode"]) == list(expected["_episode"]) == [True, False]
         assert info["episode"]["t"].shape == (2,)
-        if mode != DISABLED:  # whose mask Gymnasium's own wrapper loses
+        if mode != DISABLED:  # Gymnasium's own wrapper loses the mask in this mode.
             for _ in range(10):
                 for env in (ours, theirs):
                     env.step(np.array([0, 0]))
@@ -247,7 +247,7 @@ def test_statistics_and_episode_info_equal_those_of_gymnasium(tmp_path, mode):
 
 
 def test_masked_reset_leaves_other_episodes_running(tmp_path):
-    """Without early resets, others are refused before anything is reset."""
+    """If early resets are forbidden, they are refused before anything is reset."""
     vector = VectorCorridor(LENGTHS, DISABLED)
     with mjrec.Monitor(vector, tmp_path, allow_early_reset=False) as env:
         both, first = np.array([True, True]), np.array([True, False])
@@ -278,7 +278,7 @@ def test_masked_reset_leaves_other_episodes_running(tmp_path):
     ],
 )
 def test_unsupported_options_are_errors(tmp_path, made, options, error, message):
-    """The error names the alternative; no file is made."""
+    """The error names the alternative, and no file is created."""
     with pytest.raises(error, match=message):
         mjrec.Monitor(VectorCorridor(**made), tmp_path / "run", **options)
     assert not list(tmp_path.iterdir())
@@ -286,7 +286,7 @@ def test_unsupported_options_are_errors(tmp_path, made, options, error, message)
 
 def test_subprocess_environments_are_asked_for_name_and_timestep(tmp_path):
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}
-    # A process forked beside an OpenGL context hangs in its own.
+    # A process forked while an OpenGL context exists hangs when it uses its own.
     vector = AsyncVectorEnv(
         [lambda: gymnasium.make("Hopper-v5", **view)], context="spawn"
     )
@@ -299,7 +299,7 @@ def test_subprocess_environments_are_asked_for_name_and_timestep(tmp_path):
 
 def monitored_hopper(directory):
     def make():
-        # A spawned process has imported nothing.
+        # A spawned process has not imported anything.
         import gymnasium
 
         import mjrec
@@ -315,7 +315,7 @@ def monitored_hopper(directory):
     [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
 )
 def test_monitors_inside_subprocesses_record_whole_videos(tmp_path, context, mode):
-    """Subprocesses are daemonic."""
+    """Daemonic subprocesses cannot start `multiprocessing` children."""
     make = monitored_hopper(tmp_path)
     env = AsyncVectorEnv([make, make], context=context, autoreset_mode=mode)
     workers = {process.pid for process in env.processes}
@@ -343,7 +343,7 @@ def tiles_at(path, *, step):
 @pytest.mark.parametrize("kind", ["sync", "one object"])
 @pytest.mark.parametrize("mode", MODES)
 def test_tiled_video_shows_all_sub_environments(corridors, tmp_path, mode, kind):
-    """It follows the first one's episodes and manifest; a hidden frame is noted."""
+    """The video follows the first sub-environment, and metadata notes hidden frames."""
     vector = corridors(mode, kind=kind, lengths=(2, 3, 2), size=(32, 64))
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         play(env, 8)
@@ -384,18 +384,18 @@ def test_incomplete_tiled_video_has_its_reason(corridors, tmp_path, reason):
 
 
 def frame_of(env):
-    # Gymnasium draws into the current context.
+    # Gymnasium renders into the current context.
     env.unwrapped.mujoco_renderer.viewer.make_context_current()
     return env.render()
 
 
-# Takes more than five seconds: every environment alone, and all in one video.
+# Takes more than five seconds: each environment is rendered alone and tiled.
 def test_tiles_equal_the_frames_of_each_environment(tmp_path):
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}
     several = [gymnasium.make("Hopper-v5", **view) for _ in range(2)]
     vector = SyncVectorEnv([lambda e=e: e for e in several])
     expected = []
-    gc.collect()  # frees OpenGL contexts of earlier tests
+    gc.collect()  # This frees the OpenGL contexts of earlier tests.
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         env.reset(seed=4)
         for _ in range(2):
@@ -407,7 +407,7 @@ def test_tiles_equal_the_frames_of_each_environment(tmp_path):
 
 
 def test_bad_frame_is_an_error_or_a_warning(tmp_path, caplog):
-    """With `on_error="warn"` there is no tiled video; too few frames are an error."""
+    """A bad tiled frame may be only a warning, but too few frames always fail."""
     vector = VectorCorridor(heights=(32, 48))
     with (
         mjrec.Monitor(vector, tmp_path / "raise", tiled=True) as env,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verifying what may be anybody's: files, processes, and code that is not run."""
+"""Verify untrusted archives without trusting their files, processes or code."""
 
 import gzip
 import json
@@ -30,7 +30,7 @@ EVIL = "evil_of_mjrec_tests"
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
-    """A packed run of two episodes with videos."""
+    """Return a packed run of two episodes with videos."""
     place = tmp_path_factory.mktemp("packed")
     honest_runs.pendulum(place / "recorded", episodes=2)
     return mjrec.pack(place / "recorded", place / "run.zip")
@@ -38,13 +38,13 @@ def packed(tmp_path_factory):
 
 @pytest.fixture
 def bag(packed, tmp_path):
-    """The same, unpacked, to be changed."""
+    """Return an unpacked copy of the run to edit."""
     return unpacked(packed, tmp_path / "bag")
 
 
 @pytest.fixture
 def temporary(tmp_path, monkeypatch):
-    """Where temporary folders are made."""
+    """Return the folder in which temporary folders are created."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -52,17 +52,17 @@ def temporary(tmp_path, monkeypatch):
 
 
 def failures(bag, level="files"):
-    """Return what contradicts an archive, line by line."""
+    """Return everything that contradicts an archive, one failure per line."""
     found = mjrec.verify(bag, level=level)
     return "\n".join(f"{each.item}: {each.reason}" for each in found.failures)
 
 
 def test_honest_archive_is_whole(packed, bag):
-    """Zipped, or as `unzip` leaves it, by its own folder or by the one around it."""
+    """The path may be the zip, its unpacked folder, or the folder around that."""
     for path in (packed, bag, bag.parent):
         found = mjrec.verify(path, level="files")
         assert found.failures == ()
-        # Nothing was recreated.
+        # The verdict is partial because nothing was recreated.
         assert found.verdict is Verdict.PARTLY
 
 
@@ -80,7 +80,7 @@ def test_honest_archive_is_whole(packed, bag):
     ],
 )
 def test_changed_bag_is_found(change, said, bag):
-    """Where the author of the change has not written the manifests anew."""
+    """The author of the change has not updated the manifests."""
     change(bag)
     assert said in failures(bag)
 
@@ -90,7 +90,7 @@ def test_changed_bag_is_found(change, said, bag):
     ["../outside", "/etc/passwd", "data/../../outside", "C:/x", "data\\x", "bagit.txt"],
 )
 def test_bag_that_names_files_outside_is_found(name, bag):
-    """None of them is opened."""
+    """No file outside the bag is opened."""
     with (bag / "manifest-sha512.txt").open("a") as file:
         file.write(f"{'0' * 128}  {name}\n")
     assert re.search("leads out|absolute|backslash|bagit.txt", failures(bag))
@@ -105,14 +105,14 @@ def test_bag_that_names_files_outside_is_found(name, bag):
     ],
 )
 def test_unknown_version_is_found(name, text, bag):
-    """What a newer version means, this one cannot know."""
+    """This version cannot know what a newer one means."""
     (bag / name).write_text(text)
     make_bag_fit(bag)
     assert name in failures(bag)
 
 
 def test_link_in_an_unpacked_run_is_refused(bag):
-    """It may lead anywhere."""
+    """A link may lead anywhere."""
     (bag / "data/link").symlink_to("README.md")
     with pytest.raises(mjrec.UnreadableArchive, match="link"):
         mjrec.verify(bag, level="files")
@@ -120,7 +120,7 @@ def test_link_in_an_unpacked_run_is_refused(bag):
 
 @parametrize("suffix", [".mjb.gz", ".framehash"], default=[".mjb.gz"])
 def test_files_that_unpack_to_no_end_do_no_harm(suffix, bag):
-    """Before they have filled anything."""
+    """Unpacking stops before it fills memory or disk."""
     if suffix == ".mjb.gz":
         bomb = gzip.compress(bytes(1 << 30), 9)
         the(bag, "openaigym.model.*.mjb.gz").write_bytes(bomb)
@@ -131,7 +131,7 @@ def test_files_that_unpack_to_no_end_do_no_harm(suffix, bag):
 
 
 def test_environment_file_is_not_believed(bag):
-    """What cannot be read there is a failure, in the sandbox as all else."""
+    """An unreadable file is a failure."""
     (bag / "data/environment.json").write_text("[" * 100_000)
     make_bag_fit(bag)
     assert "environment.json" in failures(bag, "stats")
@@ -143,7 +143,7 @@ def test_environment_file_is_not_believed(bag):
 
 
 def meddled(path, meddle):
-    """Verify, and call `meddle` with the number of the first process that there is."""
+    """Verify, and call `meddle` with the id of the first child process."""
     before, met = children(), set()
 
     def look(_):
@@ -165,7 +165,7 @@ def meddled(path, meddle):
 def test_death_of_a_process_is_a_failure_with_its_reason(
     packed, monkeypatch, signum, reason
 ):
-    """It is no error: nothing is proved. One that is silent for so long is ended."""
+    """A dead or silent process means FAIL, not an exception."""
     if signum == signal.SIGSTOP:
         monkeypatch.setattr("mjrec.evidence.verify._TIMEOUT_S", 2.0)
     found = meddled(packed, lambda child: os.kill(child, signum))
@@ -174,7 +174,7 @@ def test_death_of_a_process_is_a_failure_with_its_reason(
 
 
 def test_processes_have_limits_and_no_trust(packed, monkeypatch):
-    """The models that the user trusts are not what a stranger has packed."""
+    """Models that the user trusts do not extend to a stranger's archive."""
     monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
     seen = {}
 
@@ -191,7 +191,7 @@ def test_processes_have_limits_and_no_trust(packed, monkeypatch):
 
 @pytest.mark.usefixtures("default_signals", "no_process_is_left")
 def test_interruption_leaves_nothing(packed, temporary):
-    """Ctrl-C: no process, no temporary folder."""
+    """After Ctrl-C, no process or temporary folder remains."""
     with pytest.raises(KeyboardInterrupt):
         mjrec.verify(
             packed,
@@ -202,7 +202,7 @@ def test_interruption_leaves_nothing(packed, temporary):
 
 
 def test_nothing_is_left_and_nothing_is_written_elsewhere(bag, temporary):
-    """What was unpacked is removed, and what was given is as before."""
+    """Unpacked files are removed, and the input is unchanged."""
     before = {path: path.stat().st_mtime_ns for path in bag.rglob("*")}
     mjrec.verify(bag, level="stats")
     assert {path: path.stat().st_mtime_ns for path in bag.rglob("*")} == before
@@ -211,7 +211,7 @@ def test_nothing_is_left_and_nothing_is_written_elsewhere(bag, temporary):
 
 @pytest.mark.thorough
 def test_folders_that_killed_verifications_left_are_removed(packed, temporary):
-    """Not those of the living, nor those that may be anything else."""
+    """Folders that are in use or of unknown origin are kept."""
     names = ("killed", "living", "unknown")
     killed, living, unknown = (temporary / f"mjrec-verify-{name}" for name in names)
     for folder in (killed, living, unknown):
@@ -226,7 +226,6 @@ def test_folders_that_killed_verifications_left_are_removed(packed, temporary):
 
 
 def test_process_ends_with_its_parent(packed, tmp_path):
-    """However that one dies."""
     program = (
         "import os, sys, mjrec\n"
         "def told(progress):\n"
@@ -267,7 +266,7 @@ ENVIRONMENTS = [
     ids=lambda environment: str(sorted(environment.items()))[:60],
 )
 def test_code_that_an_archive_names_is_not_run(environment, bag, tmp_path, monkeypatch):
-    """Neither an entry point nor a module of an id nor a wrapper."""
+    """Entry points, modules of ids, and wrappers are never imported."""
     marker, modules = tmp_path / "marker", tmp_path / "modules"
     modules.mkdir()
     (modules / f"{EVIL}.py").write_text(f"open({str(marker)!r}, 'w')\n")
@@ -288,7 +287,7 @@ def test_code_that_an_archive_names_is_not_run(environment, bag, tmp_path, monke
 
 @pytest.mark.thorough
 def test_model_that_includes_files_from_outside_is_not_compiled(tmp_path):
-    """A secret would be in what is drawn of it."""
+    """Rendering the model could reveal a secret file."""
     secret = tmp_path / "secret.xml"
     secret.write_text("<mujoco><option timestep='0.5'/></mujoco>")
     honest_runs.mjcf(tmp_path / "run")
@@ -315,14 +314,14 @@ def test_model_that_includes_files_from_outside_is_not_compiled(tmp_path):
     ],
 )
 def test_options_are_checked_first(options, kind, tmp_path):
-    """Before the archive is looked for, which the error names."""
+    """Options are checked before the archive is looked for."""
     for path in (tmp_path / "nothing.zip", tmp_path):
         with pytest.raises(kind, match=None if options else str(path)):
             mjrec.verify(path, **options)
 
 
 def test_files_beside_recordings_of_a_directory_do_not_matter(bag):
-    """Of a directory that was not packed; what is called like ours does."""
+    """Extra files in a plain directory are ignored unless named like recordings."""
     recordings = Path(shutil.move(bag / "data/recordings", bag.parent / "own"))
     (recordings / "notes.txt").write_text("mine")
     assert failures(recordings, "stats") == ""
@@ -332,7 +331,7 @@ def test_files_beside_recordings_of_a_directory_do_not_matter(bag):
 
 
 def test_facts_say_what_was_verified_with_what(packed):
-    """The archive's hash, versions, and the seed of a sample, which is drawn anew."""
+    """They have the archive's hash, versions, and a fresh random seed for sampling."""
     first, second = (
         mjrec.verify(packed, level="files", sample=1).facts for _ in range(2)
     )
