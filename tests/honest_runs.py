@@ -277,7 +277,7 @@ def frame_missing(directory):
 
 
 def _on_a_full_disk(directory, longest, full, **options):
-    """Record three episodes with the disk full at these steps of the second one.
+    """Record three episodes with the disk full during some steps of the second one.
 
     Step -1 is the reset.
     """
@@ -287,7 +287,7 @@ def _on_a_full_disk(directory, longest, full, **options):
             with contextlib.ExitStack() as limits:
                 for step in range(-1, longest):
                     if (episode, step) == (1, full.start):
-                        # A thread stores the model, which this test must not disturb.
+                        # A background thread must store the model while there is room.
                         wait_until(lambda: list(directory.glob("*.mjb.gz")))
                         limits.enter_context(file_size_limit(200))
                     if (episode, step) == (1, full.stop):
@@ -309,7 +309,7 @@ def end_lost(directory):
 
 
 def end_written_late(directory):
-    """Keep recording after the disk is full at the last step of an episode."""
+    """Keep recording after the disk was full at the last step of an episode."""
     _on_a_full_disk(directory, 4, range(3, 4))
 
 

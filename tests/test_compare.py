@@ -48,7 +48,7 @@ def made(packed, tmp_path):
 
 
 def compared(given, made, *, is_described=False, **options):
-    """Compare two runs, after updating descriptions unless `is_described`."""
+    """Update descriptions unless `is_described`, then compare two runs."""
     if not is_described:
         describe_again(given)
     comparison = Comparison(given, made, **options)

@@ -111,7 +111,7 @@ def test_a_deferred_video_is_the_live_one(tmp_path):
     for key in [*same.split(), "decoded_sha256", "file_sha256", "gl_renderer"]:
         assert live[key] == deferred[key], key
     assert deferred["playback_speed"] == 1
-    # At 25 steps a second, every third step is shown, and the last one.
+    # At 25 steps a second, every third step is shown, plus the last one.
     assert (deferred["stride"], deferred["fps"]) == (3, "25/3")
     assert deferred["frame_steps"] == [[0, 3], [4, 4]]
     assert len(frames_in(directory, 0)) == 3
@@ -235,7 +235,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
 
 # Takes more than five seconds: the same video is rendered with one and three workers.
 def test_changes_of_the_model_show_and_one_worker_draws_the_bytes_of_three(tmp_path):
-    """Colors change by themselves, and textures change after `model_changed`."""
+    """Color changes show at once, texture changes after `model_changed`."""
     videos = set()
     for workers in (1, 3):
         directory = tmp_path / str(workers)
@@ -273,7 +273,7 @@ before = state()
 
 
 def test_a_script_without_opengl_and_a_main_guard(tmp_path):
-    """OpenGL stays unloaded, the script runs once, and random states are kept."""
+    """OpenGL stays unloaded, the script runs once, and random states stay the same."""
     bare, recorded = SCRIPT.split("env = mjrec")
     script = tmp_path / "script.py"
     (tmp_path / "h5py.py").write_text("raise RuntimeError('not this one')")

@@ -94,7 +94,7 @@ def reward(aspect, size=None):
         ("llvmpipe", frame(36.0, 12.0), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.001), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.02), DIFFERENT),
-        # These are a black square of 8x8 pixels in frames of 480x480 and 64x64.
+        # A patch of 0.017 or 0.125 is 8 pixels wide in a frame of 480 or 64 pixels.
         ("llvmpipe", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
         ("machine", frame(48.0, 70.0, shadow=0.001, patch=0.017), DIFFERENT),
         ("h100", frame(48.0, 70.0, shadow=0.001, patch=0.017), WITHIN),
@@ -153,7 +153,7 @@ def test_turns_by_rk4_differ_between_major_versions_only():
 
 
 def test_the_same_claim_of_two_recordings_is_one_excuse():
-    """An excuse for the whole archive includes those of its recordings."""
+    """An excuse for the whole archive absorbs those for single recordings."""
     excuses = [excuse_of("numpy", "1", "2", item) for item in ("a", "b", "a")]
     assert [each.items for each in merged(excuses)] == [("a", "b")]
     assert [e.items for e in merged([*excuses, excuse_of("numpy", "1", "2")])] == [()]

@@ -131,7 +131,7 @@ def test_a_dead_encoder(pendulum, out, kill_ffmpeg, caplog):
 def test_an_environment_that_cannot_be_drawn_any_more(
     on_error, pendulum, out, monkeypatch
 ):
-    """The video ends, and a reset continues after the error."""
+    """The video ends, and a reset lets the simulation continue after an error."""
     monitor = pendulum(render="live", on_error=on_error)
     run(monitor, 4)
     why = "the window is gone"
@@ -168,10 +168,10 @@ def test_videos_that_cannot_be_rendered(on_error, pendulum, out, monkeypatch, ca
 
 @both_ways
 def test_a_full_disk_while_an_episode_is_recorded(on_error, pendulum, out):
-    """The trajectory ends there, and earlier recordings stay whole."""
+    """The trajectory ends at that step, and earlier recordings stay whole."""
     monitor = pendulum(workers=0, on_error=on_error)
     run(monitor)
-    # A thread stores the model, which this test must not disturb.
+    # A background thread must store the model while there is room.
     wait_until(lambda: list(out.glob("*.mjb.gz")))
     with file_size_limit(200), raised(on_error, FileNotWritten, "Cannot write"):
         run(monitor)

@@ -93,7 +93,7 @@ call_it_successful = each(4, lambda run, episode: run.say(episode, success=True)
 
 
 def leave_states_out(run, episode):
-    """Remove states like `pack --episodes`, without saying so in the manifest."""
+    """Remove states as `pack --episodes` does, but leave the manifest as it is."""
     facts = {"states_left_out": True, "video": None, "model": None}
     left_out = {"state": None, "snapshot": None, "snapshots": np.empty(0)}
     run.edit_rows(episode, frame_steps=np.empty(0, np.int64), facts=facts, **left_out)
@@ -359,7 +359,7 @@ def second_track(run):
 
 
 def rotation(run):
-    """Rotate the video so that a robot that lies seems to stand."""
+    """Rotate the video so that a fallen robot seems to stand."""
     content = bytearray(run.video(1).read_bytes())
     matrix = content.index(b"tkhd") + 4 + 4 * 10
     assert content[matrix : matrix + 4] == b"\0\1\0\0"
@@ -920,7 +920,7 @@ def by_hand(directory):
 
 
 def evaluated_and_swapped(directory):
-    """Keep the video of an evaluation's worst episode as its best."""
+    """Record an evaluation and choose its worst episode as the best."""
     honest.evaluated(directory, keep="none")
     ended = [*recorded_results(directory)]
     folder, worst = min(ended, key=lambda each: each[1].total_reward or 0.0)
@@ -1281,7 +1281,7 @@ BELIEVED = {
         r"same .*0 of 0.u, episode 1 of 0.u;(.|\n)*same .*2 of 0.u, episode 3 of 0.u;",
     ),
     "one recording shown as two": (honest.pendulum, copy_the_recording, "same"),
-    # The first lines say what the reader lacks.
+    # The first lines of the report say what the reader needs.
     "one of two recordings called of one's own environment": (
         honest.several,
         lambda run: replace_in_second(run, PENDULUM, "My-v0"),
@@ -1295,7 +1295,7 @@ BELIEVED = {
     "closed whenever an episode goes wrong, and resumed": (
         *(close_and_go_on, None, "continues after them"),
     ),
-    # The return of such an episode counts, and the first lines name the episode.
+    # The episode's return counts, and the first lines of the report name the episode.
     "the encoder killed before the fall": (
         *(honest.encoder_killed, None),
         r"faults while recording.* video of episode 1(.|\n)*\[broken video\]",

@@ -50,7 +50,7 @@ def test_psnr_and_ssim_have_known_values():
 
 @pytest.mark.parametrize(("y", "x"), [(0, 0), (20, 20), (22, 30), (47, 63)])
 def test_worst_block_notices_few_pixels_anywhere(y, x):
-    """Pixels count across block corners and at the edge of the frame too."""
+    """Pixels across block corners and at the frame's edge count too."""
     frame = np.full((48, 64, 3), 40, np.uint8)
     changed = frame.copy()
     changed[y : y + 4, x : x + 4] = 255

@@ -107,7 +107,7 @@ def test_a_model_that_changes_at_every_step(tmp_path, env_id, before, workers):
 @pytest.mark.dm_control
 @pytest.mark.parametrize("is_older", [False, True])
 def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
-    """Closing it leaves no context current, or dm_control's, which does not notice."""
+    """All frames are rendered although closing the other renderer changes contexts."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     options = {"video_callable": lambda _: True, "render": "live", **SIZE}
     drawn = []

@@ -316,7 +316,7 @@ def write_change(header, path):
 
 
 def replace_compiled_model(content, packed, path, **facts):
-    """Replace a compiled model by other bytes, with matching facts."""
+    """Replace a compiled model with other bytes and matching facts."""
     digest = hashlib.sha256(content).hexdigest()
     facts = {"sha256": digest, "bytes": len(content), "mjb": path.name, **facts}
     facts |= {"mujoco": mujoco.__version__, "xml": None}

@@ -181,7 +181,7 @@ def test_rules_over_all_episodes_keep_all_until_close(
     ],
 )
 def test_trajectories_are_kept_apart_from_videos(tmp_path, options, kept):
-    """The trajectory of an episode that lost its place promises no video."""
+    """The trajectory of an episode that was not chosen lists no video."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
     assert numbers(tmp_path.glob("*.h5")) == kept
@@ -260,7 +260,7 @@ def test_full_disk_at_close_loses_no_chosen_video(tmp_path, on_error):
 
 @pytest.mark.parametrize(("returns", "kept"), [([2, 4], 0), ([4, 2], 1)])
 def test_full_disk_at_metadata_of_a_live_candidate(returns, kept, tmp_path):
-    """The candidate's metadata is written if it is chosen; else its files go."""
+    """The candidate gets metadata if it is chosen, and otherwise loses its files."""
 
     def full(video, metadata):
         raise mjrec.FileNotWritten(video, "No space left on device")

@@ -95,7 +95,7 @@ def test_selection_during_a_run_equals_sorting_at_its_end(rewards, count):
 
 
 def test_failures_follow_success_or_termination():
-    """A failed episode counts as a failure, and selection stops after the last one."""
+    """A failed episode counts as a failure, and the rule stops after N failures."""
     success, terminated = [True, False, None, None, None], [True, *[False] * 3, True]
     ended = episodes(1, 2, 3, None, 4, success=success, terminated=terminated)
     failures = [(number, "failure") for number in (1, 3, 4)]

@@ -314,7 +314,7 @@ def test_a_recorder_killed_between_two_things_loses_no_episode(place, tmp_path):
     if place in LIVE:
         assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [3, 3]
         facts = [metadata_of(tmp_path, number) for number in (0, 1)]
-        # At most four frames a second are shown, and the last one.
+        # At most four frames a second are shown, plus the last one.
         assert [each["frame_steps"] for each in facts] == [[[0, 3], [4, 4]]] * 2
     else:
         paths = sorted(tmp_path.glob("*.h5"))

@@ -88,7 +88,7 @@ def test_children_share_the_gpus_that_there_are(tmp_path, monkeypatch, caplog):
     ],
 )
 def test_gpus_are_filled_one_after_the_other(each, gpus, given):
-    """Workers that share a GPU are adjacent, and more workers start over."""
+    """Consecutive workers share a GPU, and further workers start over at the first."""
     share = GpuShare(each=each)
     assert [share.of(seat, gpus) for seat in range(8)] == given
 

@@ -39,7 +39,7 @@ STATS_TEXT = (
     ],
 )
 def test_damage_of_manifest_and_statistics_is_named(tmp_path, content, reason):
-    """Each kind of damage is one clear error."""
+    """Each kind of damage causes one clear error."""
     path = tmp_path / "openaigym.some.0.1.json"
     read = read_manifest
     if content is not None:

@@ -90,7 +90,7 @@ def test_same_content_makes_the_same_files_once(directory, tmp_path, mjcf):
     facts = store_model(directory, model, authored)
     files = {path.name: path.read_bytes() for path in directory.iterdir()}
     assert sorted(files) == [facts["mjb"], facts["xml"]]
-    assert files[facts["mjb"]][4:8] == bytes(4)  # gzip's time
+    assert files[facts["mjb"]][4:8] == bytes(4)  # Gzip must not store a time.
     with zipfile.ZipFile(directory / facts["xml"]) as archive:
         assert {member.date_time[0] for member in archive.infolist()} == {1980}
     other = tmp_path / "other"

@@ -108,7 +108,7 @@ def test_other_programs_take_the_bag(bag):
 
 
 def test_names_in_the_zip_are_plain(archive):
-    """All names are sorted in one folder, without times or owners."""
+    """Entries are sorted in one folder and have no times or owners."""
     with zipfile.ZipFile(archive) as packed:
         infos = packed.infolist()
     names = [info.filename for info in infos]
@@ -274,7 +274,7 @@ def test_the_environment_says_what_drew_encoded_and_packed(recorded, infix, bag)
 
 
 def test_the_readme_leads_a_stranger(infix, recorded, bag):
-    """It covers what the run is, how to verify it, and how videos were chosen."""
+    """The README says what the run is, how to verify it, and why videos were chosen."""
     returns = mjrec.load_results(recorded)["episode_rewards"]
     text = readme_of(bag)
     for part in (
@@ -293,7 +293,7 @@ def test_the_readme_leads_a_stranger(infix, recorded, bag):
 
 
 def test_the_readme_leads_to_a_replay(bag, tmp_path, monkeypatch):
-    """Its commands copy the recordings and make a page for an episode."""
+    """The README's commands copy the recordings and make a page for an episode."""
     monkeypatch.chdir(shutil.copytree(bag, tmp_path / "bag"))
     copy, replay = re.findall(r"(?:    (cp .*)|`mjrec (replay .*?)`)", readme_of(bag))
     subprocess.run(copy[0].split(), check=True)

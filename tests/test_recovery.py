@@ -401,7 +401,7 @@ def test_only_the_killed_monitors_files_are_touched(cut, corridor, play):
 
 
 def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path):
-    """Files of a living renderer stay."""
+    """Unfinished files of a living renderer are kept."""
     for number in (0, 1):
         write_log(tmp_path, number)
     mjrec.recover(tmp_path)
@@ -466,7 +466,7 @@ def test_what_cannot_be_recovered_is_one_error(cut):
 
 
 def test_gyms_own_directories_are_left_alone(tmp_path):
-    """A gym manifest cannot be restored, so HDF5 is not even loaded."""
+    """Gym manifests cannot be restored, and HDF5 is not even loaded."""
     names = [
         "openaigym.episode_batch.0.77.stats.json",
         "openaigym.video.0.77.video000000.meta.json",

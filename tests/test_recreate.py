@@ -193,7 +193,7 @@ def test_a_malformed_random_state_is_refused(state, pendulum):
 
 
 def test_a_random_state_leads_to_the_same_beginning(pendulum):
-    """The seed is unknown except for an unused dm_control generator."""
+    """The seed can be recovered only from an unused dm_control generator."""
     pendulum.environment.reset(seed=3)
     before = pendulum.random_state()
     first = pendulum.environment.reset()[0]
@@ -242,7 +242,7 @@ def test_options_of_a_reset_are_plain():
 
 @pytest.mark.dm_control
 def test_a_task_of_the_suite_is_made_again():
-    """Its arguments are kept, and its generator's state reveals the seed."""
+    """The task keeps its arguments, and its generator's state reveals the seed."""
     pytest.importorskip("dm_control.suite")
     kwargs = {"task_kwargs": {"random": 5, "time_limit": 0.2}}
     said = facts("dm_control/cartpole-balance", framework="dm_control", kwargs=kwargs)

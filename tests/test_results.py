@@ -76,7 +76,7 @@ def test_detection_takes_exact_names_in_order(tmp_path):
 
 
 def test_clearing_removes_only_monitor_files(tmp_path, monkeypatch):
-    """Manifest and journal go first, links keep their targets, and locks prevent it."""
+    """Manifest and journal go first, link targets stay, and a lock prevents it all."""
     touch(tmp_path, *MONITOR_FILES[:-1], *HIDDEN_FILES[1:], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
@@ -103,7 +103,7 @@ def test_merge_sorts_episodes_by_time(tmp_path):
     write_saved(tmp_path, "0.7", 1, 4, start=0.5, types="te")
     # Gym notes a type at each reset, so there are more types than episodes.
     write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="ette")
-    write_saved(tmp_path, "2.7", 5, types=None)  # This means training.
+    write_saved(tmp_path, "2.7", 5, types=None)  # None means training.
     paths = sorted(tmp_path.glob("*.stats.json"))
     assert mjrec.merge_stats_files(paths) == (
         [0, 1, 1, 0, 2],
@@ -178,7 +178,7 @@ def video(directory, infix, episode_id, suffix):
 
 
 def test_journal_episode_has_its_facts_and_files(tmp_path):
-    """The journal says more than statistics, and other monitors' videos are ignored."""
+    """The journal adds details, and other monitors' videos are ignored."""
     facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
     write_journal(tmp_path, "0.7", entry(27, **facts), 28)
     write_saved(tmp_path, "0.7", 27, 28)

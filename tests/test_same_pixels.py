@@ -116,7 +116,7 @@ def make(env_id, **kwargs):
 
 
 def test_full_quality(workers, tmp_path):
-    """Use Gymnasium's shadows and antialiasing, which the other tests reduce."""
+    """This test uses default shadows and antialiasing, which the others reduce."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array")
     live = record(gymnasium.wrappers.TimeLimit(env, 2), tmp_path)
     check_frames(tmp_path, live, workers[:1])

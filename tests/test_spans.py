@@ -83,7 +83,7 @@ def test_counted_rows_are_readable_at_once(logs, path, mapped):
 
 
 def test_one_log_returns_several_recordings_bit_for_bit(logs, tmp_path):
-    """Each has its own rows and facts, whether or not it ended."""
+    """Each recording has its own rows and facts, whether or not it ended."""
     lengths = [3, 0, 17, 40, 2]
     facts = [{**FACTS, "number": 0}, {"number": 1}, {}, {**FACTS, "seed": 8}, FACTS]
     for number, steps in enumerate(lengths):
@@ -281,7 +281,7 @@ def test_death_in_a_journal_line_loses_only_that_line(logs, tmp_path, line, part
 
 
 def test_truncated_log_reports_lost_rows(logs, path):
-    """If other rows replace them, reading is an error."""
+    """Reading fails if other rows replace those that were lost."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -401,7 +401,7 @@ def test_model_change_can_be_added_again_after_a_full_disk(logs, path):
 
 
 def test_new_log_begins_for_other_rows_and_long_logs(logs, tmp_path, monkeypatch):
-    """A recording that may be deleted alone also gets its own log."""
+    """Recordings that may be deleted alone have logs of their own too."""
     other = row_dtype(state=STATE, action=np.dtype(("<i4", ACTION.shape)))
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
     write(logs, 5, episode=0)
@@ -471,7 +471,7 @@ def test_log_of_an_open_monitor_is_not_removed(logs, path, monkeypatch):
 
 @pytest.mark.parametrize("more", [-1, 1])
 def test_new_journal_replaces_a_removed_one_of_the_same_name(tmp_path, more):
-    """`force` empties a directory like this."""
+    """The argument `force` removes files in the same way."""
     for number in range(4):
         logs, count = new_logs(tmp_path, INFIX), 4 + more * number
         for each in range(count):

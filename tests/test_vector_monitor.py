@@ -84,7 +84,7 @@ def test_each_sub_environment_has_whole_videos(corridors, tmp_path, caplog, kind
 
 # Takes more than five seconds: 64 videos.
 def test_sixty_four_sub_environments(tmp_path):
-    """Each has a trajectory and a video, and their log tails share 4 MiB."""
+    """Each sub-environment has a trajectory and video; all log tails share 4 MiB."""
     with mjrec.Monitor(pendulums(64), tmp_path, workers=2, quality="draft") as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
@@ -116,7 +116,7 @@ def test_each_monitor_reports_its_own_failures(tmp_path):
 
 
 def test_close_restores_the_sub_environments(corridors, tmp_path):
-    """Each closes once; until then, calls reach it through its monitor."""
+    """Each sub-environment closes once, and until then calls go through its monitor."""
     vector = corridors()
     originals = list(vector.envs)
     scaled = TransformReward(vector, lambda rewards: 10 * rewards)
@@ -299,7 +299,7 @@ def test_subprocess_environments_are_asked_for_name_and_timestep(tmp_path):
 
 def monitored_hopper(directory):
     def make():
-        # A spawned process has not imported anything.
+        # A spawned process starts without these imports.
         import gymnasium
 
         import mjrec

@@ -80,7 +80,7 @@ def test_honest_archive_is_whole(packed, bag):
     ],
 )
 def test_changed_bag_is_found(change, said, bag):
-    """The author of the change has not updated the manifests."""
+    """The manifests reveal any change that does not update them too."""
     change(bag)
     assert said in failures(bag)
 
@@ -174,7 +174,7 @@ def test_death_of_a_process_is_a_failure_with_its_reason(
 
 
 def test_processes_have_limits_and_no_trust(packed, monkeypatch):
-    """Models that the user trusts do not extend to a stranger's archive."""
+    """A stranger's archive gets no trust from the user's settings."""
     monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
     seen = {}
 
@@ -331,7 +331,7 @@ def test_files_beside_recordings_of_a_directory_do_not_matter(bag):
 
 
 def test_facts_say_what_was_verified_with_what(packed):
-    """They have the archive's hash, versions, and a fresh random seed for sampling."""
+    """The facts have the archive's hash, versions, and a fresh seed for the sample."""
     first, second = (
         mjrec.verify(packed, level="files", sample=1).facts for _ in range(2)
     )
