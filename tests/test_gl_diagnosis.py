@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error messages of mujoco 3.3, 3.17 and 4.0 lead to causes and fixes."""
+"""Test the causes and fixes given for errors of mujoco 3.3, 3.17 and 4.0."""
 
 import pytest
 
