@@ -44,7 +44,7 @@ def own_state_home(tmp_path_factory):
 def default_signals():
     """Start child processes with the default handling of SIGINT and SIGHUP.
 
-    Children of `nohup` or of a background job would inherit that both are ignored.
+    Otherwise, a child started under `nohup` or in a background job ignores both.
     """
     earlier = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)

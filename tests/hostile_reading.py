@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read hostile files in forked processes.
 
-`Inspector` starts one process that forks for each file, with a gigabyte of memory.
-A fork that crashes, hangs or runs out of memory is an outcome.
+`Inspector` starts one process, which forks for each file with a gigabyte of memory.
+It also reports forks that crash, hang or run out of memory.
 """
 
 import io

@@ -11,7 +11,7 @@ INFIX = "0.1"
 NAME = trajectory_prefix(INFIX, 27)
 FACTS = {"env_id": "E-v0", "seed": 7, "limit": float("inf")}
 STATE = packed([("qpos", ("<f8", (2,))), ("time", ("<f8", (1,)))])
-# This layout makes rows have padding between their arrays.
+# This layout puts padding between the arrays of a row.
 SNAPSHOT = packed(
     [
         ("geom_xpos", ("<f8", (2, 3))),
@@ -26,7 +26,7 @@ DTYPE = row_dtype(
 
 
 def rows(count, dtype=DTYPE):
-    """Return random rows, of which the first are the same for every `count`."""
+    """Return random rows; the first rows are the same for every `count`."""
     data = np.random.default_rng(1).bytes(count * dtype.itemsize)
     return np.frombuffer(data, dtype)
 

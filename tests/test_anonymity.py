@@ -133,7 +133,7 @@ def contents(directory):
 
 @pytest.fixture(scope="module")
 def packed(author, recorded, tmp_path_factory):
-    """Return two directories, with anonymous archives and with named ones."""
+    """Return a directory of anonymous archives and one of archives that keep names."""
     before = contents(recorded)
     directories = {how: tmp_path_factory.mktemp(how) for how in ("anonymous", "named")}
     for how, directory in directories.items():

@@ -35,7 +35,7 @@ def test_archive_contains_files_then_their_list(tmp_path):
     first, second = make(tmp_path, "b"), make(tmp_path, "a", ".json")
     archive = io.BytesIO()
     archive.write(b"before")
-    # `load_results` returns strings, so these must work too.
+    # `load_results` returns strings, so strings must be accepted like paths.
     write_archive([first, tuple(map(str, second))], archive)
     archive.seek(len(b"before"))
     contents = {}
@@ -84,7 +84,7 @@ def test_archive_holds_at_most_100_videos(tmp_path):
         (["a.mp4 a.json"], "'a.json' is not a metadata file name"),
         (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
         (["Manifest.json"], "the archive's manifest"),
-        # As in gym, presence is checked before duplicates, and duplicates before names.
+        # As in gym, missing files are reported first, then duplicates, then bad names.
         (["a.mp4 -"], "the metadata of the video"),
         (["b+c.mp4", "-"], "not a video name"),
         (["-", "b+c.mp4"], "The video "),

@@ -74,7 +74,7 @@ def test_free_camera_is_the_models_default_or_the_given_object():
         *((other, "must be a name, a number or") for other in (True, 0.0, None)),
     ],
 )
-def test_unknown_cameras_are_errors_with_the_known(camera, message):
+def test_error_for_an_unknown_camera_lists_the_valid_ones(camera, message):
     with pytest.raises(InvalidArgument, match=message) as caught:
         resolve_camera(model_with(FRONT_AND_SIDE), camera)
     if isinstance(caught.value, UnknownName):

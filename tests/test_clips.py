@@ -62,7 +62,7 @@ def hop(env, steps):
 
 
 def reach(env, steps):
-    """Take steps without resetting, because dm_control's `step` resets by itself."""
+    """Reset only once, because dm_control's `step` resets after a last step."""
     env.reset()
     for number in range(steps):
         env.step(np.full(2, 0.1 * (number % 7)))
@@ -213,7 +213,7 @@ def test_clip_ends_early_where_the_model_is_replaced(tmp_path, caplog):
 
 
 def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
-    """The frames before the disk was full are still rendered."""
+    """Frames recorded before the disk was full are still rendered."""
     options = {**CLIP, "video_length": 9, "on_error": "warn"}
     with mjrec.Monitor(hopper(), tmp_path, **options) as monitor:
         hop(monitor, 5)

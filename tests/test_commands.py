@@ -166,7 +166,7 @@ def test_every_command_shows_returns_that_are_nan(command, tmp_path, monkeypatch
 
 # Takes more than five seconds: each of three videos starts renderers.
 def test_cameras_make_one_video_each_or_one_tiled_video(command, tmp_path):
-    """Both ways also work for a model file, which plays at 60 frames per second."""
+    """The videos of a model file play at 60 frames per second."""
     (tmp_path / "model.xml").write_text(PENDULUM)
     run = ("record", tmp_path / "model.xml", "--max-steps", 2, "--size", "64x48")
     run = (*run, "--camera", "front", "--camera", -1)

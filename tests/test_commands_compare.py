@@ -59,7 +59,7 @@ def test_table_follows_cautions_and_precedes_the_conclusion(two, write, compare)
     assert compare(two[0], failed).out.startswith(caution)
 
 
-def test_json_has_the_figures_by_the_names_of_require(two, compared):
+def test_json_figures_have_the_names_that_require_takes(two, compared):
     fields = compared(*two, "--seed", "3", "--confidence", "0.9")
     assert (fields["a"], fields["b"], fields["unmet"]) == ([two[0]], [two[1]], [])
     assert fields["bootstrap"] == {"resamples": 200, "seed": 3, "confidence": 0.9}

@@ -32,7 +32,7 @@ say(
 
 
 def test_confined_process_reaches_only_its_files(tmp_path, monkeypatch):
-    """The process has no token, network or real home, but can still render."""
+    """The process sees no token, network or real home, but can still render."""
     folders = {name: tmp_path / name for name in ("readable", "other", "place")}
     for folder in (*folders.values(), tmp_path / "modules"):
         folder.mkdir()

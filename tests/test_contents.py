@@ -168,7 +168,7 @@ def test_invalid_options_are_rejected(options, part, recorded, place):
     assert part in refusal(mjrec.InvalidArgument, recorded, place, **options)
 
 
-def test_unknown_episodes_are_named_with_the_known(recorded, place):
+def test_error_for_unknown_episodes_lists_the_valid_ones(recorded, place):
     message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
     assert message.endswith("with the number 9. Available: 0, 1.")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test scenes, obstacles and resets without OpenGL of dm_control environments."""
+"""Test dm_control scenes, obstacles to rendering them, and resets without OpenGL."""
 
 import json
 

@@ -51,7 +51,7 @@ def steps(monitor, count):
 
 
 def test_failing_step_ends_its_episode_unless_it_goes_on(monitored, tmp_path):
-    """The video keeps its frames, and its metadata has the exception."""
+    """The video keeps its frames, and its metadata contains the exception."""
     env, monitor = monitored
     for seed in range(2):
         monitor.reset(seed=seed)

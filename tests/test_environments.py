@@ -48,7 +48,7 @@ def trajectory(made, seeds, *, steps=10):
     "name", ["HalfCheetah-v5", "dm_control/cheetah-run", "A B.MJCF"]
 )
 def test_episode_depends_only_on_its_seeds(name, tmp_path, monkeypatch):
-    """Earlier episodes do not change an episode."""
+    """An episode does not depend on earlier episodes."""
     if name.startswith("dm_control/"):
         pytest.importorskip("dm_control")
     monkeypatch.chdir(tmp_path)
@@ -208,7 +208,7 @@ WRONG = [
     ("dm_control/cheetah", {}, InvalidArgument, "dm_control/<domain>-<task>"),
     ("./robot.txt", {}, InvalidArgument, r"\.xml or \.mjcf"),
     ("robto.xml", {}, mjrec.UnknownName, r"MJCF file .*Available: .*robot.xml"),
-    # Suggestions ignore versions; without a suggestion, the error explains names.
+    # Suggestions ignore versions; if there are none, the error explains valid names.
     ("halfcheeta-v9", {}, mjrec.UnknownName, CHEETAH),
     ("zz/zzz-v0", {}, mjrec.UnknownName, r"colon.*dm_control/<domain>"),
     ("no_such_module:X-v0", {}, mjrec.EnvironmentNotMade, "no_such_module"),

@@ -51,7 +51,7 @@ def test_seed_determines_random_parts_of_models():
 
 
 def test_monitor_knows_the_seed(tmp_path):
-    """The monitor is told the seed, because `reset` in dm_env takes none."""
+    """dm_env's `reset` takes no seed, so the monitor must get it in another way."""
     made = named("ball_in_cup-catch")
     with mjrec.Monitor(made.environment, tmp_path, False, env_id="x") as monitor:
         made.begin_episode(monitor, episode_seeds(0, 0))
@@ -144,7 +144,7 @@ def test_begin_seeds_once_as_users_of_the_suite_do(task):
         np.testing.assert_equal(dict(first), dict(theirs.reset().observation))
 
 
-def test_another_seed_begins_anew():
+def test_new_seed_overrides_earlier_state():
     """A new seed overrides the environment's own seed and earlier episodes."""
     fresh, used = (named("pendulum-swingup", seed=7) for _ in range(2))
     used.environment.reset()

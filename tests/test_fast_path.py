@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test that the recorder's fast path records the same as its usual path."""
+"""Test that the recorder's fast path records the same data as its usual path."""
 
 import itertools
 import os
@@ -169,7 +169,7 @@ def test_rewards_of_any_type_become_floats(kind, schedule, tmp_path):
 
 
 def test_step_with_an_invalid_reward_is_not_recorded(tmp_path):
-    """Later steps are recorded, and `step` works even if it closes the monitor."""
+    """Later steps are recorded, and `step` returns if the monitor is closed in it."""
     rewards = iter([1.0, 1.0, "much", 1.0])
 
     def give(reward):

@@ -79,7 +79,7 @@ def test_frames_of_a_video_are_decoded_with_simulated_times(video, labels):
     strip = film_strip(video, frames=6, columns=3)
     decoded = np.array(frames_of(video)[::2])[:, :HEIGHT].astype(int)
     assert np.abs(cells(strip, 2, 3) - decoded).max() <= 2
-    # The margins are white, and labels stand below the frames.
+    # The margins are white, and the labels are below the frames.
     assert (strip[:2] == 255).all()
     assert (strip[:, :2] == 255).all()
     assert strip[2 + HEIGHT : strip.shape[0] // 2, :, 0].min() < 64
@@ -97,7 +97,7 @@ def test_frames_of_a_video_are_decoded_with_simulated_times(video, labels):
         '{"height": 3, "width": 3, "timestep": "1/20"}',
     ],
 )
-def test_invalid_metadata_leave_the_times_of_the_video(video, tmp_path, text, labels):
+def test_invalid_metadata_does_not_change_the_times(video, tmp_path, text, labels):
     """Metadata with an impossible number of frames must not be trusted."""
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(video.read_bytes())

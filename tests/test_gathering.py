@@ -260,7 +260,7 @@ def verdict(outcome, **fields):
 
 
 def test_verdicts_come_from_the_directory_and_from_given_files(tmp_path):
-    """Findings that are only noted are not counted."""
+    """Findings with the outcome `noted` are not counted."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
     found, given = tmp_path / "run" / "verification.json", tmp_path / "other.json"
     outcomes = [{"outcome": each} for each in ("recreated", "believed", "noted")]

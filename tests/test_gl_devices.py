@@ -17,15 +17,15 @@ from mjrec.gl.egl import EglDevice
 # CUDA_VISIBLE_DEVICES was unset, "0" or the UUID of the GPU.
 H100 = EglDevice(index=0, device_file="", cuda_id=0, software=False, in_use=True)
 H100 = replace(H100, uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b")
-# EGL's answer was this while the variable was empty, "1", "-1" or another UUID.
+# With the variable empty, "1", "-1" or another UUID, EGL reported this instead.
 HIDDEN = replace(H100, cuda_id=None)
-# The order of vendor files decides whether this comes before or after the GPU.
+# The order of the vendor files decides whether llvmpipe precedes the GPU.
 LLVMPIPE = replace(HIDDEN, software=True, in_use=False, uuid="")
 OTHER = replace(HIDDEN, index=1, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211")
 
 
 def run(code, **variables):
-    """Run `code` in a Python with only these variables for OpenGL."""
+    """Run `code` in a new Python with only these OpenGL variables."""
     head = (
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
@@ -66,7 +66,7 @@ def test_egl_device_is_found_by_cuda_number_or_uuid(devices, gpu, expected):
 
 
 def test_visible_gpus_are_those_of_cudas_variable_or_openable_files(tmp_path):
-    """CUDA ignores everything from the first invalid entry of the variable on."""
+    """CUDA ignores the first invalid entry of the variable and all later ones."""
     cases = {" 2 , GPU-1a2b ": ["2", "GPU-1a2b"], "": [], "-1": [], "0,-1,2": ["0"]}
     for text, expected in cases.items():
         assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected

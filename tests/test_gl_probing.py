@@ -77,7 +77,7 @@ DEAF = "import signal; signal.pthread_sigmask(0, range(1, 64)); signal.pause()"
     ("code", "timeout", "cause"),
     [
         ("import ctypes; ctypes.string_at(0)", 120, "The driver crashed (SIGSEGV)"),
-        # A message of an unknown error is shown unchanged.
+        # The message of an unknown error is shown unchanged.
         ("raise SystemExit('the moon is in another quarter')", 120, "the moon is in"),
         (DEAF, 0.2, "The driver hangs"),
     ],
@@ -90,7 +90,7 @@ def test_end_of_the_child_is_explained(tmp_path, code, timeout, cause, monkeypat
     assert cause in answer.cause
 
 
-def test_software_rendering_beside_a_gpu_is_a_warning(tmp_path, monkeypatch):
+def test_software_rendering_despite_a_gpu_is_a_warning(tmp_path, monkeypatch):
     software = Probe("egl", renders=True, gl_renderer="llvmpipe (LLVM 15)")
     hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
     assert (software.software, hardware.software) == (True, False)

@@ -58,7 +58,7 @@ def test_file_names_stay_portable():
     assert matcher.replaced_in_name("0.rooty.mbrunelli") == "0.rooty.user"
 
 
-def test_short_words_in_binary_data_are_chance():
+def test_short_words_in_binary_data_are_ignored():
     """Only a long name or a name within a line of text is a match."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.found_in_bytes(b"\x00\xffAlan:/vm:\xfe\x01") == []

@@ -16,7 +16,7 @@ from mjrec.formats.locks import Lock, try_lock, wait_for_lock
 path = pathlib.Path(sys.argv[1])
 """
 WAIT = 'print("held", flush=True)\nsys.stdin.read()\n'
-# A program or a forked child outlives the holder of the lock.
+# These children, a program and a fork, outlive the holder of the lock.
 SURVIVORS = {
     "exec": 'subprocess.Popen(["cat"], stdout=subprocess.DEVNULL, close_fds=False)\n',
     "fork": "if os.fork(): sys.stdin.read()\nlock.release()\n",
@@ -97,7 +97,7 @@ def test_lock_is_exclusive_between_processes(path, start):
 
 @pytest.mark.parametrize("get", [try_lock, wait_for_lock])
 @pytest.mark.parametrize("put", [os.symlink, os.link, lambda _, path: os.mkfifo(path)])
-def test_links_and_pipes_are_no_locks(put, get, path):
+def test_links_and_pipes_are_rejected_as_locks(put, get, path):
     victim = path.with_name("victim")
     victim.write_text("valuable")
     put(victim, path)

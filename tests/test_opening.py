@@ -93,7 +93,7 @@ def test_invalid_next_number_is_an_error(tmp_path, number):
 
 
 def test_resume_over_another_environment_is_an_error(tmp_path):
-    """The error names both environments, even after an open or killed monitor."""
+    """The error names both environments, even if a monitor is open or was killed."""
     again = {"resume": True, "env_id": ANOTHER}
     with monitor(tmp_path / "a") as env:
         with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):

@@ -65,7 +65,7 @@ def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
 
 
 def test_short_process_exits_silently():
-    """The child process that lists packages ends without a message."""
+    """The child process that lists packages ends silently with its parent."""
     program = (
         "import logging; logging.basicConfig()\n"
         "from mjrec import child_python, provenance\n"

@@ -41,7 +41,7 @@ def test_invalid_timestep_is_an_error(timestep):
 
 @pytest.mark.parametrize("timestep", [1.234567, 1e-6, 12.3456789])
 def test_rate_of_any_timestep_fits_a_video_file(timestep):
-    """Numerator and denominator are at most a million; the error is a millionth."""
+    """The fraction's terms are at most a million, and its error at most a millionth."""
     rate = rate_from_timestep(timestep)
     assert max(rate.numerator, rate.denominator) <= MAX_DENOMINATOR
     assert float(rate) * timestep == pytest.approx(1, rel=1e-6)

@@ -168,7 +168,7 @@ def test_gallery_filters_by_mouse_and_keyboard(benchmark):
 
 @pytest.mark.thorough
 def test_command_is_copied_or_selected(benchmark):
-    """If the browser denies local files the clipboard, the text is selected instead."""
+    """If the browser denies access to the clipboard, the text is selected instead."""
     card = benchmark.locator("#video-0")
     card.get_by_text("File, hash and command").click()
     command = card.get_by_role("button", name="Copy the command")

@@ -59,7 +59,7 @@ def test_hostile_text_stays_text():
     assert not [name for name in attributes if name[:2] == "on" or name == "style"]
     assert not set("\u202e\u2028\x00\x1b") & set(page)
     assert r"abc\u202edef\u2028ghi" in page
-    # All addresses are files next to the page or anchors on it.
+    # All addresses must be files next to the page or anchors within it.
     addresses = [
         found[name]
         for _, found in elements.found
@@ -131,7 +131,7 @@ def test_notes_explain_missing_and_different_figures():
 
 
 def test_page_of_many_episodes_holds_a_selection():
-    """The page lists episodes with videos, failures, the best and the worst."""
+    """The page keeps the best and worst episodes and those with videos or failures."""
     returns = np.arange(30_000.0)
     returns[:3] = (-1e307, 0.123456789, 1e307)
     large = task("a", returns, failures={17_000: "boom"}, score_range=None)

@@ -52,7 +52,7 @@ def test_help_installs_nothing(checkout, command):
 
 
 def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
-    """A changed pyproject.toml, an interruption or a moved checkout requires it."""
+    """Reasons are a changed pyproject.toml, an interruption or a moved checkout."""
     venv = checkout / ".venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
     assert not succeeds(checkout, IS_INSTALLED)

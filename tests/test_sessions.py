@@ -53,7 +53,7 @@ def test_deferred_drawing_needs_no_gl(options, tmp_path):
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
 def test_missing_gl_error_suggests_deferred_drawing(tmp_path, render):
-    """If live frames were requested, the error does not suggest this."""
+    """If live frames were requested, the error must not suggest deferring them."""
     out = tmp_path / "out"
     with pytest.raises(GLError, match="Nothing renders here") as raised:
         list(record_session(session(out, render=render)))

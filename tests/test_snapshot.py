@@ -22,7 +22,7 @@ from mjrec.simulation.snapshot import (
 from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView
 
-# The cables are a taut one, a slack one with an active limit, and a colored one.
+# One cable is taut, one is slack with an active limit, and one is colored.
 TENDONS = """
 <mujoco>
   <worldbody>
@@ -42,7 +42,7 @@ TENDONS = """
 </mujoco>
 """
 
-# A small model in which most visual options show something; it has no skin.
+# Most visual options show something in this small model, which has no skin.
 THINGS = """
 <mujoco>
   <option timestep=".005"/>

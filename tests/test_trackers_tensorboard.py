@@ -73,7 +73,7 @@ def test_video_is_logged_as_an_animated_gif(finished):
             frame = opened.convert("RGB")
             assert frame.getpixel((4 * step + 1, 16))[0] > 150
             assert frame.getpixel((min(4 * step + 7, 47), 16))[0] < 60
-    # A long video keeps its duration but loses frames.
+    # A long video keeps its duration but is shown with fewer frames.
     long = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
     with Image.open(io.BytesIO(long)) as opened:
         assert opened.n_frames <= 100
@@ -109,7 +109,7 @@ def test_runs_have_their_own_names(finished, tmp_path):
 
 
 def test_damaged_files_are_named(finished, tmp_path):
-    """Errors of ffmpeg are raised by `end` at the latest, and events are kept."""
+    """Errors of ffmpeg are raised by `end` at the latest; earlier events are kept."""
     finished.video.path.write_bytes(b"no video")
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)

@@ -89,7 +89,7 @@ def test_late_video_is_logged_at_its_own_step(finished, tmp_path):
 
 @pytest.mark.parametrize("how", ["given", "active", "beside"])
 def test_foreign_run_stays_open(how, finished, tmp_path):
-    """With options of its own, the tracker starts and ends a run of its own."""
+    """A tracker with options starts and ends a separate run."""
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()
     theirs = wandb.init(**offline(tmp_path / "theirs"))

@@ -80,7 +80,7 @@ def test_tracker_receives_each_deferred_video_once_finished(tmp_path):
 
 
 def test_failing_tracker_is_dropped_and_others_continue(tmp_path, caplog):
-    """The log and the manifest have the reason why the tracker was dropped."""
+    """The log and the manifest say why the tracker was dropped."""
     failing, other = RecordingTracker(("episode", "end")), RecordingTracker()
     record(tmp_path, failing, other, render="live")
     assert [kind for kind, *_ in failing.events] == ["begin", "episode", "end"]

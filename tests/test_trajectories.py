@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test recorded episodes as arrays, with the model of each step."""
+"""Test reading recorded episodes as arrays, with the model of each step."""
 
 import gymnasium
 import mujoco
@@ -36,7 +36,7 @@ def record(directory, change=lambda step, model: None, **options):
 
 
 def in_both_forms(path):
-    """Yield the recording while it is in flight, then the finished file."""
+    """Yield the trajectory loaded in flight, then loaded from the finished file."""
     yield mjrec.load_trajectory(str(path))
     yield mjrec.load_trajectory(finish_trajectory(path))
 

@@ -18,7 +18,7 @@ def test_ending_a_worker_on_its_own_thread_does_not_block(end):
 
 
 def test_forks_and_interpreter_exit_do_not_wait_for_the_thread():
-    """In a fork `put` raises, and a script with a hanging consumer still exits."""
+    """In a fork, `put` raises an error; a hanging consumer does not block the exit."""
     code = (
         "import os, threading\n"
         "from mjrec.errors import ClosedError\n"

@@ -5,7 +5,7 @@ Run the script in an environment with gym 0.7.4 to 0.22 and numpy<1.24::
 
     python tests/legacy/record_gym.py tests/data/gym
 
-Its style is old because some versions of gym need Python 3.6.
+The code must run on Python 3.6, because some versions of gym need it.
 """
 
 import multiprocessing
@@ -20,7 +20,7 @@ from gym import version, wrappers
 
 
 class Tiny(gym.Env):
-    """Counts steps, and has both old (`_step`) and new names of gym's methods."""
+    """An environment that counts steps, with gym's old (`_step`) and new methods."""
 
     metadata = {"render.modes": ["ansi"], "video.frames_per_second": 2}  # noqa: RUF012 as in gym
     observation_space = gym.spaces.Discrete(100)
