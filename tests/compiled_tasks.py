@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dm_control task with another model in each episode."""
+"""A dm_control task whose model changes in each episode."""
 
 
 def growing():
-    """Return a composer task that compiles another model at each reset."""
+    """Return a composer task that compiles a new model at each reset."""
     from dm_control import composer
 
     class Growing(composer.Task):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared fixtures: OpenGL's backend, small environments and helpers."""
+"""Shared fixtures: the OpenGL backend, small environments and helpers."""
 
 import gc
 import importlib.util
 import os
 import signal
 
-# Before anything imports mujoco, which reads it once.
+# mujoco reads this variable once, when it is imported.
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 from pathlib import Path
@@ -25,7 +25,7 @@ from mjrec.rendering import finish
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
-# It runs in its own environment.
+# These tests run only in an environment with Stable-Baselines3.
 collect_ignore = ["test_stable_baselines3.py"]
 if importlib.util.find_spec("stable_baselines3"):
     collect_ignore.clear()
@@ -42,14 +42,14 @@ def own_state_home(tmp_path_factory):
 
 @pytest.fixture
 def default_signals():
-    """Start child processes with SIGINT and SIGHUP as in a terminal.
+    """Start child processes with the default handling of SIGINT and SIGHUP.
 
-    `nohup` and background jobs ignore them, and so would every child.
+    Otherwise, a child started under `nohup` or in a background job ignores both.
     """
     earlier = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if earlier[signal.SIGHUP] is signal.SIG_IGN:
-        # Children do not inherit a handler; this process survives, as `nohup` asks.
+        # Unlike an ignored signal, a handler is not inherited by children.
         signal.signal(signal.SIGHUP, lambda *_: None)
     yield
     for signum, handler in earlier.items():
@@ -61,7 +61,7 @@ def pytest_report_header():
 
 
 class Corridor(gymnasium.Env):
-    """Ends after `length` steps and draws its position, without a simulator."""
+    """An environment without a simulator whose frames show its position as a bar."""
 
     metadata: ClassVar = {
         "render_modes": ["rgb_array", "ansi", "rgb_array_list"],
@@ -104,8 +104,8 @@ class Corridor(gymnasium.Env):
 def free_dm_control_scenes(request):
     """Free dm_control's OpenGL contexts on the thread that made them.
 
-    Its environments are cyclic garbage. If another thread of a later test collects
-    them, dm_control fails there, because this thread holds the context.
+    The environments are cyclic garbage. If another thread collects them during a
+    later test, dm_control fails, because this thread holds the context.
     """
     yield
     if request.node.get_closest_marker("dm_control"):
@@ -114,7 +114,7 @@ def free_dm_control_scenes(request):
 
 @pytest.fixture(scope="session")
 def pendulums(tmp_path_factory):
-    """Return a function that records once per session, for tests that only read."""
+    """Return a function that records pendulums once per session for read-only use."""
     made = {}
 
     def recorded(episodes, **options):
@@ -130,13 +130,13 @@ def pendulums(tmp_path_factory):
 
 @pytest.fixture
 def corridor():
-    """Return an environment of three steps with 48x32 frames."""
+    """Return an environment with episodes of three steps and 48x32 frames."""
     return Corridor()
 
 
 @pytest.fixture
 def make_corridor():
-    """Return the class of `corridor`."""
+    """Return the `Corridor` class."""
     return Corridor
 
 
@@ -173,7 +173,7 @@ def kill_ffmpeg():
 
 @pytest.fixture
 def no_process_is_left():
-    """Check that a test leaves no process, not even a zombie."""
+    """Check that a test leaves no process behind, not even a zombie."""
     before = children()
     yield
     gc.collect()
@@ -182,7 +182,7 @@ def no_process_is_left():
 
 @pytest.fixture
 def stuck_encoder(tmp_path_factory, monkeypatch):
-    """Let encoders hang; the returned file exists when one has begun."""
+    """Make encoders hang; the returned file appears when one has started."""
     begun = tmp_path_factory.mktemp("encoder") / "begun"
     program = begun.with_name("ffmpeg")
     program.write_text(
@@ -196,7 +196,7 @@ def stuck_encoder(tmp_path_factory, monkeypatch):
 
 @pytest.fixture
 def painter(monkeypatch):
-    """Draw without processes and OpenGL; the encoder is real."""
+    """Render without processes or OpenGL, but encode with the real encoder."""
     painter = Painter()
     monkeypatch.setattr(finish, "WorkerPool", lambda count, **rest: painter)
     return painter
@@ -204,13 +204,13 @@ def painter(monkeypatch):
 
 @pytest.fixture
 def names():
-    """Return a function that lists all names in a directory, sorted."""
+    """Return a function that lists a directory's file names in sorted order."""
     return lambda directory: sorted(p.name for p in Path(directory).iterdir())
 
 
 @pytest.fixture
 def halfcheetah():
-    """Return a small HalfCheetah-v5 that can be drawn."""
+    """Return a HalfCheetah-v5 that renders small frames."""
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
     yield env
     env.close()

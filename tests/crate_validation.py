@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validates an RO-Crate with roc-validator, without a network.
+"""Validate an RO-Crate with roc-validator, without a network.
 
-A Python with `roc-validator` and `rocrate` runs it. The validator fetches only the
-JSON-LD context; `rocrate` contains a later one with all terms of version 1.1.
+Run this in a Python that has `roc-validator` and `rocrate`. The validator fetches only
+the JSON-LD context; `rocrate` contains a later one with all terms of version 1.1.
 """
 
 import json
@@ -20,7 +20,7 @@ def main(folder):
         status_code = 200
         text = json.dumps(context)
         content = text.encode()
-        headers = {"Content-Type": "application/ld+json"}  # noqa: RUF012  as requests
+        headers = {"Content-Type": "application/ld+json"}  # noqa: RUF012  as in requests
 
         def json(self):
             return context

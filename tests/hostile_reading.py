@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read hostile files in forked processes.
 
-`Inspector` starts one process that forks for each file, with a gigabyte of memory.
-A fork that crashes, hangs or runs out of memory is an outcome.
+`Inspector` starts one process, which forks for each file with a gigabyte of memory.
+It also reports forks that crash, hang or run out of memory.
 """
 
 import io
@@ -32,7 +32,7 @@ SECONDS = 120  # long enough for a busy machine
 
 
 class Inspector:
-    """A process that reads files on request."""
+    """A process that reads files on request, each in a fork."""
 
     def __enter__(self):
         environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
@@ -47,8 +47,8 @@ class Inspector:
     def read(self, reader, path):
         """Return the outcome of reading `path` with one of `READERS`.
 
-        Its `kind` is `value`, `refused` (an error of mjrec), `failed` (another error)
-        or `died`; it has the error, the path that the error names, and the seconds.
+        `kind` is `value`, `refused` (an error of mjrec), `failed` (another error) or
+        `died`. Other attributes are the error, the path that it names, and the seconds.
         """
         self._process.stdin.write(f"{json.dumps([reader, str(path)])}\n")
         self._process.stdin.flush()
@@ -58,12 +58,12 @@ class Inspector:
         return outcome
 
     def reads(self, reader, path):
-        """Check that `path` is read soon."""
+        """Check that `path` can be read quickly."""
         outcome = self.read(reader, path)
         assert outcome.kind == "value", outcome
 
     def refuses(self, reader, path):
-        """Check that reading `path` gives one short error soon, and return it."""
+        """Check that reading `path` quickly raises one short error, and return it."""
         outcome = self.read(reader, path)
         assert outcome.kind == "refused", outcome
         assert outcome.path == str(path), outcome

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program whose recordings name their author in every place.
+"""A program whose recordings name their author wherever they can.
 
-Tests copy it into the author's home directory and run it there.
+Tests copy this file into the author's home directory and run it there.
 """
 
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A search for words in files, archives and compressed data, without mjrec."""
+"""Search for words in files, archives and compressed data, without using mjrec."""
 
 import gzip
 import io
@@ -14,9 +14,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def find(path, words):
-    """Return the pairs of place and word in a file or directory.
+    """Return the place and the word of each match in a file or directory.
 
-    Names of files count, also in archives and HDF5 files.
+    The search includes file names, even those in archives and HDF5 files.
     """
     forms = [(word, {word.lower().encode(e) for e in _ENCODINGS}) for word in words]
     return [
@@ -82,7 +82,7 @@ def _bytes(value):
 
 
 def _inside_png(where, content):
-    """Yield the compressed texts of an image."""
+    """Yield the text chunks of a PNG image, decompressed."""
     start = len(_PNG)
     while start < len(content):
         end = start + 12 + int.from_bytes(content[start : start + 4])

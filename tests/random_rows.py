@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of random bytes, with NaNs of every kind, to compare bit for bit."""
+"""Recordings of random bytes, including NaNs of every kind, to compare exactly."""
 
 import numpy as np
 from trajectories_by_hand import add_row
@@ -11,7 +11,7 @@ INFIX = "0.1"
 NAME = trajectory_prefix(INFIX, 27)
 FACTS = {"env_id": "E-v0", "seed": 7, "limit": float("inf")}
 STATE = packed([("qpos", ("<f8", (2,))), ("time", ("<f8", (1,)))])
-# Rows have padding between their arrays.
+# This layout puts padding between the arrays of a row.
 SNAPSHOT = packed(
     [
         ("geom_xpos", ("<f8", (2, 3))),
@@ -26,7 +26,7 @@ DTYPE = row_dtype(
 
 
 def rows(count, dtype=DTYPE):
-    """Return random rows; longer results begin with the same rows."""
+    """Return random rows; the first rows are the same for every `count`."""
     data = np.random.default_rng(1).bytes(count * dtype.itemsize)
     return np.frombuffer(data, dtype)
 
@@ -34,7 +34,7 @@ def rows(count, dtype=DTYPE):
 def write(
     logs, steps, *, episode=27, every=1, facts=FACTS, dtype=DTYPE, first=0, span=None
 ):
-    """Record an episode without an end, or continue one from step `first`."""
+    """Record an unfinished episode, or continue one from step `first`."""
     span = span or logs.begin(trajectory_prefix(INFIX, episode), facts, dtype)
     for step, row in enumerate(rows(steps + 1, dtype)):
         parts = {name: row[name] for name in dtype.names[4:]}
@@ -49,7 +49,7 @@ def write(
 
 
 def check(content, steps, *, every=1, dtype=DTYPE):
-    """Check that a recording equals the rows of `write`."""
+    """Check that a recording equals what `write` recorded."""
     expected = rows(steps + 1, dtype)
     assert content.dtype == dtype
     assert content.rewards.tolist() == [k / 3 for k in range(1, steps + 1)]
@@ -64,7 +64,7 @@ def check(content, steps, *, every=1, dtype=DTYPE):
         assert content.observations.tobytes() == expected["observation"].tobytes()
     if "snapshot" in dtype.names:
         assert content.frame_steps.tolist() == list(range(0, steps + 1, every))
-        # Padding is zero.
+        # The padding must be zero.
         frames = np.zeros(len(content.frame_steps), dtype["snapshot"])
         for name in frames.dtype.names:
             frames[name] = expected["snapshot"][name][::every]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builders of report contents."""
+"""Build contents of reports."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +13,9 @@ from mjrec.reporting.contents import ReportContents, ReportTask, ReportVideo, Ve
 
 _FEW = Bootstrap(resamples=50)
 
-# Markup, quotes, ends of scripts and comments, a template, a mark that reverses
-# text, line ends that JSON allows and JavaScript did not, a formula,
-# addresses, and very long names.
+# These include markup, quotes, a template, a formula, addresses, very long names, a
+# mark that reverses text, and a line separator that JSON allows but old JavaScript
+# does not.
 HOSTILE = (
     "<script>alert(1)</script>",
     "</script><script>alert(2)</script>",
@@ -34,7 +34,7 @@ HOSTILE = (
 
 
 def task(name, returns, *, seeds=1, failures=None, score_range=(0.0, 1e3), **changes):
-    """Return a task with equally many episodes per seed, or per monitor (`runs`)."""
+    """Return a task with the same number of episodes per seed or monitor (`runs`)."""
     count = len(returns)
     each = max(1, count // seeds)
     episodes = np.zeros(count, ROW)
@@ -88,7 +88,7 @@ def video(index=0, **changes):
 
 
 def contents(*tasks, **changes):
-    """Return a report of tasks, by default of two with five seeds each."""
+    """Return a report of tasks, by default two tasks with five seeds each."""
     if not tasks:
         tasks = (
             task("dm_control/walker-walk", _returns(900, 40), seeds=5),
@@ -106,7 +106,7 @@ def contents(*tasks, **changes):
 
 
 def hostile_report():
-    """Return contents whose texts are all hostile."""
+    """Return contents in which every text is hostile."""
     tasks = [
         task(
             text,

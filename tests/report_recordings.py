@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builders of small recordings for reports."""
+"""Build small recordings for reports."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor files of results, written by hand."""
+"""Write result files of monitors by hand."""
 
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
@@ -8,7 +8,7 @@ ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 
 
 def entry(episode_id, **facts):
-    """Return an episode whose facts follow from its number."""
+    """Return a journal entry whose values are derived from its number."""
     defaults = {
         "length": 10 + episode_id,
         "reward": float(episode_id),
@@ -24,7 +24,7 @@ def entry(episode_id, **facts):
 
 
 def write_journal(directory, infix, *episodes, **options):
-    """Write a journal of entries or episode numbers."""
+    """Write a journal from entries or episode numbers."""
     path = directory / f"openaigym.episodes.{infix}.jsonl"
     writer = JournalWriter(path, **options)
     for each in episodes:
@@ -34,7 +34,7 @@ def write_journal(directory, infix, *episodes, **options):
 
 
 def stats_of(*episodes, start=98.0, types=""):
-    """Return the statistics of episode numbers."""
+    """Return the statistics of the episodes with these numbers."""
     entries = [entry(number) for number in episodes]
     return StatsFile(
         initial_reset_timestamp=start,

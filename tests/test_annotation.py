@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captions in frames."""
 
 from dataclasses import replace
 
@@ -18,7 +17,7 @@ def plain(height, width, brightness=128):
 @pytest.mark.parametrize("size", [(64, 64), (480, 480)])
 @pytest.mark.parametrize("brightness", [0, 128, 255])
 def test_caption_contrasts_with_any_background(size, brightness):
-    """The lower half of the frame stays unchanged."""
+    """The caption leaves the lower half of the frame unchanged."""
     frame = plain(*size, brightness)
     result = annotated(frame, CAPTION)
     assert (result.shape, result.dtype) == (frame.shape, frame.dtype)
@@ -40,7 +39,7 @@ def test_caption_shows_every_value(other):
 @pytest.mark.parametrize("height", [1, 2, 7, 16, 33])
 @pytest.mark.parametrize("width", [1, 7, 33, 700])
 def test_any_frame_size_works(height, width):
-    """One pixel has no room for letters."""
+    """A frame of one pixel has no room for letters and stays unchanged."""
     long = Caption(episode_id=10**9, step=10**9, time=1e9, reward=float("nan"))
     result = annotated(plain(height, width), long)
     assert result.shape == (height, width, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anonymous copies of recordings that name their author everywhere."""
+"""Test anonymous copies of recordings that name their author everywhere."""
 
 import hashlib
 import io
@@ -33,7 +33,7 @@ MATCHER = IdentityMatcher(MBRUNELLI)
 NAMES = ("mbrunelli", "Brunelli", "Margherita", "brunelli-ws7", "brunlab")
 WORDS = (*NAMES, "m.brunelli@uni-pavia.example", "secret-gait", "home/")
 
-# Runs under the author's account.
+# This program runs under the author's account.
 PACK = """
 import sys, mjrec
 authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
@@ -43,7 +43,7 @@ mjrec.pack(source, target, authors=authors, anonymous=how == "anonymous")
 
 
 def models_have_paths():
-    """Return whether compiled models contain directories of files; not in 3.3.0."""
+    """Return whether compiled models contain paths; those of mujoco 3.3.0 do not."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.xml")
         texture = '<texture name="t" type="2d" file="t.png"/>'
@@ -76,7 +76,7 @@ class Author:
         ):
             self.call("git", *arguments)
         self.commit = self.call("git", "rev-parse", "HEAD").strip()
-        # Under another host name, where the kernel permits one.
+        # Run programs under another host name where the kernel permits it.
         naming = 'hostname brunelli-ws7 && exec "$@"'
         self.host = ["unshare", "--uts", "sh", "-c", naming, "sh"]
         tried = shutil.which("unshare") and subprocess.run([*self.host, "true"])
@@ -122,7 +122,7 @@ def author(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recorded(author):
-    """Return a directory with a directory of each kind of recordings."""
+    """Return a directory with one subdirectory per kind of recording."""
     author.python("identity_recording.py", "runs")
     return author.work / "runs"
 
@@ -133,7 +133,7 @@ def contents(directory):
 
 @pytest.fixture(scope="module")
 def packed(author, recorded, tmp_path_factory):
-    """Return a directory of anonymous archives and one of named archives."""
+    """Return a directory of anonymous archives and one of archives that keep names."""
     before = contents(recorded)
     directories = {how: tmp_path_factory.mktemp(how) for how in ("anonymous", "named")}
     for how, directory in directories.items():
@@ -146,7 +146,7 @@ def packed(author, recorded, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def anonymous(packed, tmp_path_factory):
-    """Return the pendulum's recordings in their anonymous archive."""
+    """Return the pendulum's recordings, unpacked from their anonymous archive."""
     archive = packed["anonymous"] / "pendulum.zip"
     return unpacked(archive, tmp_path_factory.mktemp("bag")) / "data" / "recordings"
 
@@ -181,7 +181,7 @@ def test_search_finds_the_identity_in_each_place_of_named_archives(packed):
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
 def test_search_and_gate_find_names_in_each_encoding(tmp_path, encoding):
-    """They find a name between bytes that are no text."""
+    """A name is found even between bytes that are not text."""
     content = bytes(range(256)) + "MBrunelli".encode(encoding) + b"\xff\xfe"
     (tmp_path / "file").write_bytes(content)
     assert find(tmp_path, ["mbrunelli"]) == [("file", "mbrunelli")]
@@ -197,7 +197,7 @@ def test_gate_finds_the_identity_in_each_kind_of_place(recorded):
 
 
 def test_anonymous_recordings_have_equal_contents(recorded, anonymous):
-    """Statistics, episodes, arrays, models and frames are equal."""
+    """Anonymous copies keep statistics, episodes, arrays, models and frames."""
     directories = (recorded / "pendulum", anonymous)
     old, new = map(mjrec.load_results, directories)
     assert new["episode_rewards"] == old["episode_rewards"]
@@ -209,7 +209,7 @@ def test_anonymous_recordings_have_equal_contents(recorded, anonymous):
         for name in ("states", "actions", "rewards", "terminated", "frame_steps"):
             np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
         np.testing.assert_equal(after.snapshots, before.snapshots)
-    # The compiled model stays unless it contains a path.
+    # The compiled model is kept unless it contains a path.
     assert any(anonymous.glob("*.mjb.gz")) != MODELS_HAVE_PATHS
     old, new = before.model(), after.model()
     for name in ("qpos0", "geom_size", "body_mass", "tex_data", "names"):
@@ -257,14 +257,14 @@ def zipped(**members):
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        # Text that only looks like a comment stays.
+        # Text that only looks like a comment is kept.
         (b'<m><!-- mine -->\n<a b="&lt;!--"/></m>', b'<m>\n<a b="&lt;!--"/></m>'),
         (b"<m><![CDATA[<!-- a -->]]></m>", b"<m><![CDATA[<!-- a -->]]></m>"),
-        # Licenses stay unless they name the author or give an address.
+        # Licenses are kept unless they name the author or give an address.
         (b"<!-- Copyright 2020 The Robots --><m/>",) * 2,
         (b"<!-- Copyright mbrunelli --><m/>", b"<m/>"),
         (b"<!-- (c) me@lab.example --><m/>", b"<m/>"),
-        # Names of elements are part of the model.
+        # Names of elements are part of the model and must not change.
         (b'<m model="mbrunelli"><body name="mbrunelli"/></m>',) * 2,
     ],
 )
@@ -286,7 +286,7 @@ def test_damaged_sources_are_rejected(content):
 
 
 def test_distinct_uids_stay_distinct(tmp_path):
-    """A number separates uids that differ only in a removed name."""
+    """Uids that differ only in a removed name are numbered."""
     name = "openaigym.episodes.0.{}.jsonl"
     for uid in ("mbrunelli", "lovelace", "user"):
         (tmp_path / name.format(uid)).write_text(f'{{"by": "{uid}"}}\n')
@@ -296,7 +296,7 @@ def test_distinct_uids_stay_distinct(tmp_path):
 
 
 def test_commands_and_gpu_ids_become_placeholders(tmp_path):
-    """Environment names, device indices and numbers of GPUs stay."""
+    """Names of environments, device indices and GPU numbers are kept."""
     card = "GPU-8f1c2b0e-5d6a-4e3b-9c7d-112233445566"
     command = ["mjrec", "record", "dm_control/cartpole-balance", "/opt/lab/policy.pt"]
     variables = {"CUDA_VISIBLE_DEVICES": f"{card},GPU-8f,2"}
@@ -313,7 +313,7 @@ def test_commands_and_gpu_ids_become_placeholders(tmp_path):
 
 
 def test_csv_headers_and_torn_journals_lose_names(tmp_path):
-    """The torn line of the journal is dropped."""
+    """The last line of the journal is torn, so it is dropped."""
     csv = tmp_path / "openaigym.results.0.7.monitor.csv"
     table = '#{"t_start": 1.5, "env_id": "/home/ada/a.xml"}\nr,l,t\n1.0,2,0.5\n'
     csv.write_text(table)

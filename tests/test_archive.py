@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Archives of videos: reproducible, and written whole or not at all."""
+"""Archives of videos are reproducible and written completely or not at all."""
 
 import gzip
 import io
@@ -22,7 +22,7 @@ def make(directory, name, suffix=".mp4"):
 
 
 def refusal(videos):
-    """Return the error for `videos`, after which the archive is empty."""
+    """Return the error for `videos`, and check that the archive is empty."""
     archive = io.BytesIO()
     with pytest.raises(ArchiveError, match=r"^\[Hopper-v5\] ") as caught:
         write_archive(videos, archive, env_id="Hopper-v5")
@@ -31,11 +31,11 @@ def refusal(videos):
 
 
 def test_archive_contains_files_then_their_list(tmp_path):
-    """It contains nothing about the machine."""
+    """The archive contains no times, users or groups of the machine."""
     first, second = make(tmp_path, "b"), make(tmp_path, "a", ".json")
     archive = io.BytesIO()
     archive.write(b"before")
-    # `load_results` returns strings.
+    # `load_results` returns strings, so strings must be accepted like paths.
     write_archive([first, tuple(map(str, second))], archive)
     archive.seek(len(b"before"))
     contents = {}
@@ -52,7 +52,7 @@ def test_archive_contains_files_then_their_list(tmp_path):
 
 
 def test_equal_videos_give_equal_archives(tmp_path):
-    """Times, modes, directory and archive name make no difference."""
+    """Times, modes, the directory and the archive's name make no difference."""
     for name, mode in (("first", 0o600), ("second", 0o755)):
         (tmp_path / name).mkdir()
         pair = make(tmp_path / name, "a")
@@ -84,7 +84,7 @@ def test_archive_holds_at_most_100_videos(tmp_path):
         (["a.mp4 a.json"], "'a.json' is not a metadata file name"),
         (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
         (["Manifest.json"], "the archive's manifest"),
-        # In gym's order: of each pair first presence, then duplicates, then names.
+        # As in gym, missing files are reported first, then duplicates, then bad names.
         (["a.mp4 -"], "the metadata of the video"),
         (["b+c.mp4", "-"], "not a video name"),
         (["-", "b+c.mp4"], "The video "),
@@ -94,7 +94,6 @@ def test_archive_holds_at_most_100_videos(tmp_path):
     ],
 )
 def test_names_must_be_plain_distinct_and_of_known_types(tmp_path, names, reason):
-    """ASCII letters, digits and three signs, with nothing after the ending."""
     (tmp_path / "other").mkdir()
     pairs = []
     for each in names:

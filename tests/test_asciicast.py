@@ -13,7 +13,7 @@ from mjrec.formats.asciicast import AsciicastWriter
 
 
 def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path):
-    """An accent has one column and a color none, and the real player plays it."""
+    """An accented letter counts as one column and a color code as none."""
     path = tmp_path / "a.json"
     writer = AsciicastWriter(path, rate=Fraction(4))
     writer.write("éé\n\x1b[41mx\x1b[0m\n")

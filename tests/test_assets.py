@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 ASSETS = Path(__file__).parents[1] / "assets"
-# The skin is a part of the showcase.
+# The skin is not a separate model but part of the showcase.
 MODELS = sorted({path.stem for path in ASSETS.glob("*.xml")} - {"finger_skin"})
 
 

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detection of blank videos."""
 
 import numpy as np
 import pytest
@@ -8,9 +7,9 @@ from mjrec.blank_frames import BlankFrames
 
 
 def frame(value=0, *, pixel=None):
-    """Return a frame of one gray, and optionally one other pixel."""
+    """Return a gray frame in which one pixel may differ."""
     frame = np.full((40, 56, 3), value, np.uint8)
-    # A coarse grid would miss this pixel.
+    # A check on a coarse grid of pixels would miss this pixel.
     frame[17, 21] = value if pixel is None else pixel
     return frame
 
@@ -34,7 +33,7 @@ CONSTANT = {"suspect_constant": True}
     ],
 )
 def test_black_constant_or_still_videos_are_suspect(frames, facts):
-    """One differing pixel is enough."""
+    """A video in which a single pixel differs is not suspect."""
     blank = BlankFrames()
     for each in frames:
         blank.add(each)

@@ -32,7 +32,7 @@ FRONT_AND_SIDE = '<camera name="front"/><camera/><camera name="side"/>'
     [("side", 2, "side"), (0, 0, "front"), (np.int64(1), 1, 1)],
 )
 def test_camera_is_found_by_name_or_number(camera, number, label):
-    """Its label is its name, or its number without one."""
+    """The label is the camera's name or, if it has none, its number."""
     model = model_with(FRONT_AND_SIDE)
     assert camera_names(model) == ["front", "side"]
     for given in (model, types.SimpleNamespace(ptr=model)):
@@ -54,7 +54,7 @@ def test_free_camera_is_the_models_default_or_the_given_object():
     assert camera.distance == expected.distance
     assert resolve_camera(model, camera) is camera
     assert camera_label(model, -1) == -1
-    # A pose from metadata is a camera too.
+    # A pose from metadata is also accepted as a camera.
     label = camera_label(model, camera)
     assert camera_label(model, resolve_camera(model, label)) == label
     with pytest.raises(InvalidArgument, match="zoom"):
@@ -67,14 +67,14 @@ def test_free_camera_is_the_models_default_or_the_given_object():
     ("camera", "message"),
     [
         ("frnt", r"front, side\..*-1"),
-        # An empty name is not the unnamed camera, and True is not camera 1.
+        # An empty name must not select the unnamed camera, nor True camera 1.
         ("", r"front, side\..*-1"),
         (-2, r"number -2\b.* from -1 .* to 2"),
         (3, r"number 3\b.* from -1 .* to 2"),
         *((other, "must be a name, a number or") for other in (True, 0.0, None)),
     ],
 )
-def test_unknown_cameras_are_errors_with_the_known(camera, message):
+def test_error_for_an_unknown_camera_lists_the_valid_ones(camera, message):
     with pytest.raises(InvalidArgument, match=message) as caught:
         resolve_camera(model_with(FRONT_AND_SIDE), camera)
     if isinstance(caught.value, UnknownName):
@@ -95,13 +95,13 @@ ARM = """
 @pytest.mark.parametrize(
     ("cameras", "inside", "found"),
     [
-        # A fixed camera on a robot moves with it, and does not track it.
+        # A fixed camera on a robot moves with the robot but does not track it.
         (FRONT_AND_SIDE, '<camera name="eye"/>', None),
         (FRONT_AND_SIDE, ROBOT + '<camera name="a" mode="trackcom"/>', "robot"),
-        # A camera of the robot comes before one of a part.
+        # A camera on the whole robot is preferred to one on a part.
         ("", PART, "trunk"),
         ("", PART + ROBOT, "robot"),
-        # The hand of a fixed arm, as in dm_control's reacher, would be a close-up.
+        # Tracking a fixed arm's hand, as in dm_control's reacher, gives a close-up.
         (ARM, "", None),
         (ARM, PART, "trunk"),
         (FRONT_AND_SIDE, '<camera mode="trackcom"/>', 3),

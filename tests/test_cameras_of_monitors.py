@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors with several cameras or with captions."""
+"""Test monitors with several cameras or with captions."""
 
 import json
 import sys
@@ -14,13 +14,13 @@ from mjrec.annotation import check_annotation
 
 SIZE = {"height": 48, "width": 64}
 
-# `physics.render()` can draw several cameras live.
+# dm_control's `physics.render()` can render several cameras live.
 WAYS = ["deferred", pytest.param("live", marks=pytest.mark.dm_control)]
 CAMERAS = {"deferred": ["track", -1], "live": ["side", "back"]}
 
 
 def record(directory, steps=3, render="deferred", **options):
-    """Record an episode; return each video's frame hashes by its name's end."""
+    """Record an episode; return the frame hashes of each video by name suffix."""
     if render == "live":
         from dm_control import suite
 
@@ -45,7 +45,7 @@ def metadata_of(video):
 # Takes more than five seconds: three monitors start workers.
 @pytest.mark.parametrize("render", WAYS)
 def test_each_camera_has_its_own_video_or_they_are_tiled(tmp_path, render):
-    """Each video equals that of a monitor with that camera alone."""
+    """Each video equals that of a monitor with only this camera."""
     first, second = CAMERAS[render]
     several = {"camera": [first, second], "render": render}
     both = record(tmp_path / "both", **several)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages between a child process and its parent."""
+"""Test messages between a child process and its parent."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ with Child("mjrec.provenance", environ=os.environ) as child:
     found = f"{messages} {child.how_it_ended()} {child.printed()}"
 pathlib.Path(sys.argv[1]).write_text(found)
 """
-# Some machines' `sitecustomize` prints.
+# On some machines, `sitecustomize` prints text.
 HELLO = "import os\nfor stream in (1, 2):\n    os.write(stream, b'hello ')\n"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clips: videos counted in steps, drawn live or later."""
+"""Test clips, which are videos counted in steps, both live and deferred."""
 
 import copy
 import json
@@ -24,7 +24,7 @@ from mjrec.rendering.recordings import recordings
 
 
 class Blinking(gymnasium.Wrapper):
-    """Shows another color after every step and reset."""
+    """A wrapper that changes the color after every step and reset."""
 
     def reset(self, **options):
         self._blink(0.5)
@@ -40,13 +40,13 @@ class Blinking(gymnasium.Wrapper):
 
 
 def hopper(length=5, **options):
-    # A caption needs this width.
+    # Narrower frames have no room for a caption.
     options |= {"max_episode_steps": length, "width": 256, "height": 48}
     return Blinking(gymnasium.make("Hopper-v5", **options))
 
 
 def reacher():
-    """Return a task that moves its target in the model at each reset."""
+    """Return a task that moves the target within its model at each reset."""
     from dm_control import suite
 
     return suite.load("reacher", "easy", {"random": 3, "time_limit": 0.08})
@@ -62,13 +62,13 @@ def hop(env, steps):
 
 
 def reach(env, steps):
-    """Take steps; after the last step of an episode, `step` resets."""
+    """Reset only once, because dm_control's `step` resets after a last step."""
     env.reset()
     for number in range(steps):
         env.step(np.full(2, 0.1 * (number % 7)))
 
 
-# It begins with the second step.
+# This clip starts at the second step.
 CLIP = {"step_trigger": lambda step: step == 1, "workers": 0}
 CLIPS = {"step_trigger": lambda step: step in (2, 20), "video_length": 13}
 
@@ -80,7 +80,7 @@ def record(directory, env, steps, **options):
 
 
 def hashes(directory):
-    """Return the frame hashes of each video, by the end of its name."""
+    """Return the frame hashes of each video by name suffix."""
     return {
         path.name.partition(".video")[2].split(".video")[-1]: hashes_at(path)
         for path in sorted(directory.glob("*.framehash"))
@@ -96,7 +96,7 @@ VIEW = {"height": 48, "width": 256, "env_id": "dm_control/some-task"}
 EVERY = {"video_callable": lambda _: True}
 
 
-# Takes more than five seconds: the same run live and deferred.
+# Takes more than five seconds: each run is recorded live and deferred.
 @parametrize(
     ("make", "steps", "options"),
     [
@@ -114,7 +114,7 @@ EVERY = {"video_callable": lambda _: True}
     default=2,
 )
 def test_deferred_frames_equal_live_frames(make, steps, options, tmp_path):
-    """Also across resets that change or compile the model."""
+    """Frames are equal even after resets that change or recompile the model."""
     metadata = []
     for render in ("live", "deferred"):
         env = make(render_mode="rgb_array") if make is hopper else make()
@@ -135,11 +135,11 @@ def test_deferred_frames_equal_live_frames(make, steps, options, tmp_path):
 @parametrize(
     ("options", "part", "frames", "fps"),
     [
-        # The first frame, six steps and two resets.
+        # The nine frames are the first one, six steps and two resets.
         ({"camera": ["track", -1]}, "step", 9, "125"),
-        # `max_fps` drops frames, and `fps` sets the rate of the file.
+        # `max_fps` drops frames, whereas `fps` sets the frame rate of the file.
         ({"fps": 12, "max_fps": 62.5}, "step", 5, "12"),
-        # A video that begins with an episode has its number.
+        # A video that starts with an episode has the episode's number.
         ({"step_trigger": None, "video_callable": (1).__eq__}, "episode", 7, "125"),
     ],
     default=2,
@@ -181,13 +181,13 @@ def test_clip_of_a_killed_process_is_rendered_whole(tmp_path):
     assert mjrec.recover(tmp_path)
     details = manifest_of(tmp_path)["mjrec"]
     [entry] = details["pending"]
-    # The next run does not use the number of the clip's last episode again.
+    # The next run must not reuse the number of the clip's last episode.
     assert (entry["episode_id"], details["next_episode_id"]) == (0, 3)
     assert main(["render", str(tmp_path)]) == 0
     [about] = metadata_in(tmp_path)
     assert (about["complete"], about["reason"]) == (False, "killed")
-    # Three steps of the first episode, five of the second and three of the third, each
-    # with the frame that it began with here.
+    # The clip has three steps of the first episode, five of the second and three of the
+    # third, and the first frame of each.
     assert (about["frame_count"], about["length"]) == (14, 11)
     assert about["last_episode_id"] == 2
     assert [name for name, _ in manifest_of(tmp_path)["videos"]] == [entry["video"]]
@@ -196,7 +196,7 @@ def test_clip_of_a_killed_process_is_rendered_whole(tmp_path):
 
 @pytest.mark.thorough
 def test_clip_ends_early_where_the_model_is_replaced(tmp_path, caplog):
-    """Earlier frames stay, and the next clip is another one."""
+    """The clip keeps its earlier frames, and a new clip can follow."""
     env = hopper()
     options = {**CLIP, "workers": 1, "video_length": 4, "mode": "evaluation"}
     with mjrec.Monitor(env, tmp_path, **options) as monitor:
@@ -213,7 +213,7 @@ def test_clip_ends_early_where_the_model_is_replaced(tmp_path, caplog):
 
 
 def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
-    """The frames before it are rendered."""
+    """Frames recorded before the disk was full are still rendered."""
     options = {**CLIP, "video_length": 9, "on_error": "warn"}
     with mjrec.Monitor(hopper(), tmp_path, **options) as monitor:
         hop(monitor, 5)
@@ -250,7 +250,7 @@ def test_hostile_clip_names_overwrite_nothing(name, tmp_path):
 
 
 class Counting(Corridor):
-    """Shows the number of steps taken as the brightness of its frames."""
+    """An environment whose frames show its step count as brightness."""
 
     taken = 0
 
@@ -269,23 +269,23 @@ def begins(*at, **options):
 @pytest.mark.parametrize(
     ("length", "steps", "options", "shown"),
     [
-        # It begins with the frame before its first step.
+        # A clip starts with the frame before its first step.
         (
             *(100, 20, begins(0, 7, video_length=4)),
             {"0.step000000": [0, 1, 2, 3, 4], "0.step000007": [7, 8, 9, 10, 11]},
         ),
-        # None begins during another.
+        # No clip starts during another one.
         (
             *(100, 8, begins(*range(0, 9, 2), video_length=3)),
             {"0.step000000": [0, 1, 2, 3], "0.step000004": [4, 5, 6, 7]},
         ),
-        # Across resets: steps 3 and 6 end an episode.
+        # The clip continues across resets, which follow steps 3 and 6.
         (3, 12, begins(2, video_length=5), {"0.step000002": [2, 3, 3, 4, 5, 6, 6, 7]}),
-        # Close ends it early.
+        # Closing the monitor ends the clip early.
         (9, 4, begins(1, video_length=50), {"0.step000001": [1, 2, 3, 4]}),
-        # Without a length it ends with its episode.
+        # A clip without a length ends with its episode.
         (5, 15, begins(3), {"0.step000003": [3, 4, 5]}),
-        # With a schedule the episode begins the video, and steps end it.
+        # With a schedule, the video starts with an episode and ends after its steps.
         (
             *(3, 15),
             {"video_callable": (0, 3).__contains__, "video_length": 4},
@@ -294,7 +294,7 @@ def begins(*at, **options):
     ],
 )
 def test_clip_has_its_first_frame_and_n_steps(length, steps, options, shown, tmp_path):
-    """A reset adds a frame and does not count."""
+    """A reset adds a frame but does not count as a step."""
     env = Counting(length)
     with mjrec.Monitor(env, tmp_path, allow_early_reset=True, **options) as monitor:
         done = True

@@ -95,7 +95,7 @@ def test_keep_lists_only_kept_videos_as_text_and_as_json(command, tmp_path):
 )
 def test_bad_input_is_one_error_and_no_directory(command, tmp_path, arguments, words):
     err = command("record", *arguments, "--out", tmp_path / "out", status=1).err
-    # MuJoCo may warn of the model before that.
+    # MuJoCo may print a warning about the model before the error.
     assert [line[:7] for line in err.splitlines()].count("mjrec: ") == 1
     assert [each for each in words if each not in err] == []
     assert not (tmp_path / "out").exists()
@@ -137,14 +137,14 @@ def test_nan_fails_unless_allowed(command, tmp_path, monkeypatch, allowed, statu
     assert "NaN or infinite: 2 returns" in out
     small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
     out, err = command("evaluate", *run, *small, "--out", "e", status=status)
-    # Without videos the frame rate does not matter.
+    # Without videos, a missing frame rate needs no warning.
     assert "does not declare a frame rate" not in err
     assert "NaN or infinite: 2 returns" in out
     assert "best" not in out
 
 
 def test_every_command_shows_returns_that_are_nan(command, tmp_path, monkeypatch):
-    """Commands that judge no run succeed."""
+    """NaN is not an error for commands that do not judge a run."""
     monkeypatch.chdir(tmp_path)
     Path("nan_env.py").write_text(NAN)
     run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, "--allow-nan")
@@ -166,7 +166,7 @@ def test_every_command_shows_returns_that_are_nan(command, tmp_path, monkeypatch
 
 # Takes more than five seconds: each of three videos starts renderers.
 def test_cameras_make_one_video_each_or_one_tiled_video(command, tmp_path):
-    """A model file plays at 60 frames per second."""
+    """The videos of a model file play at 60 frames per second."""
     (tmp_path / "model.xml").write_text(PENDULUM)
     run = ("record", tmp_path / "model.xml", "--max-steps", 2, "--size", "64x48")
     run = (*run, "--camera", "front", "--camera", -1)
@@ -205,7 +205,7 @@ def test_list_shows_pending_videos_clips_and_the_best_episode(command, tmp_path)
     assert (first["pending"], first["trajectory"]) == (False, None)
     assert (second["pending"], second["trajectory"]) == (True, trajectory.name)
     assert second["video"] is None
-    # Sub-environments number their episodes separately; a NaN is never the best.
+    # Each monitor numbers its own episodes, and a NaN is never the best return.
     write_journal(tmp_path, "1.7", "X-v0", [entry(0), entry(1, reward=9.0)])
     lines = command("list", tmp_path).out.splitlines()
     assert lines[0].split()[:2] == ["monitor", "episode"]
@@ -228,7 +228,7 @@ def test_list_shows_all_monitor_directories_below(command, tmp_path):
 
 
 def test_list_shows_episodes_of_a_finished_or_running_evaluation(command, tmp_path):
-    """While it runs, no videos have been selected."""
+    """A running evaluation has not selected its videos yet."""
     name = "openaigym.video.0.batch.video000000.mp4"
     write_recorded(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
     (tmp_path / "a-x" / name).touch()
@@ -260,7 +260,7 @@ def test_list_of_an_empty_directory_is_no_error(command, tmp_path):
     assert command("list", tmp_path).out == f"No episodes are recorded in {tmp_path}.\n"
     assert command("list", tmp_path, "--json").out == ""
     assert "nothing" in command("list", tmp_path / "nothing", status=1).err
-    # Otherwise each later command of this process would log each message again.
+    # A leftover handler would repeat every message of later commands in this process.
     assert logging.getLogger("mjrec").handlers == handlers
 
 
@@ -299,7 +299,7 @@ def test_recover_lists_recovered_files(command, tmp_path):
 
 
 def test_recover_lists_failures(command, tmp_path):
-    """It leaves the log of a newer version unchanged."""
+    """The log of a newer version cannot be recovered and stays unchanged."""
     write_log(tmp_path, 0)
     [log] = tmp_path.glob("*.log")
     [journal] = tmp_path.glob("*.jsonl")
@@ -315,9 +315,9 @@ def test_recover_lists_failures(command, tmp_path):
 
 
 def test_warnings_and_policy_errors_are_shown_once(command, tmp_path, monkeypatch):
-    """Over many episodes, and over several workers of an evaluation."""
+    """Neither later episodes nor parallel workers of an evaluation repeat a message."""
     monkeypatch.chdir(tmp_path)
-    # A spring too stiff for steps of a tenth of a second.
+    # This spring is too stiff for timesteps of a tenth of a second.
     unstable = PENDULUM.replace("<mujoco>", '<mujoco><option timestep="0.1"/>')
     unstable = unstable.replace("ref=", 'stiffness="1e9" ref=')
     Path("unstable.xml").write_text(unstable)
@@ -337,7 +337,7 @@ def test_warnings_and_policy_errors_are_shown_once(command, tmp_path, monkeypatc
 
 
 def endless(directory):
-    """Return a command that records until a signal ends it."""
+    """Return a command that records until a signal stops it."""
     command = ["record", "HalfCheetah-v5", "--out", str(directory), "--size", "64x48"]
     command += ["--seed", "0", "--episodes", "10000", "--max-steps", "20"]
     return [sys.executable, "-m", "mjrec", *command]
@@ -351,7 +351,7 @@ def endless(directory):
     default=2,
 )
 def test_signals_close_files_and_keep_all_episodes(signum, status, command, tmp_path):
-    """The command names pending videos, and `mjrec render` draws them."""
+    """The command reports pending videos, which `mjrec render` then renders."""
     process = subprocess.Popen(
         endless(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -378,7 +378,7 @@ def test_terminal_shows_a_progress_bar_of_episodes_and_steps(tmp_path):
     while b"1/10000 episodes" not in shown:
         shown += os.read(reader, 65536)
     process.send_signal(signal.SIGINT)
-    # Linux raises an OSError when the other end is closed.
+    # On Linux, reading raises an OSError when the other end is closed.
     with contextlib.suppress(OSError):
         while True:
             shown += os.read(reader, 65536)

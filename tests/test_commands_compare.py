@@ -22,7 +22,7 @@ def write(tmp_path):
 
 @pytest.fixture
 def two(write):
-    """Return two evaluations; the second is better on the first task."""
+    """Return two evaluations, of which the second is better on the first task."""
     return [
         write("a", WORSE, policy="mine:old"),
         write("b", BETTER, policy="mine:new", policy_kwargs={"gain": 2}),
@@ -36,7 +36,7 @@ def compare(command):
 
 @pytest.fixture
 def compared(compare):
-    """Return a function that returns the object of `--json`."""
+    """Return a function that parses the output of `compare --json`."""
     fast = ("--json", "--resamples", "200")
     return lambda *arguments, **rest: json.loads(compare(*arguments, *fast, **rest).out)
 
@@ -59,7 +59,7 @@ def test_table_follows_cautions_and_precedes_the_conclusion(two, write, compare)
     assert compare(two[0], failed).out.startswith(caution)
 
 
-def test_json_has_the_figures_by_the_names_of_require(two, compared):
+def test_json_figures_have_the_names_that_require_takes(two, compared):
     fields = compared(*two, "--seed", "3", "--confidence", "0.9")
     assert (fields["a"], fields["b"], fields["unmet"]) == ([two[0]], [two[1]], [])
     assert fields["bootstrap"] == {"resamples": 200, "seed": 3, "confidence": 0.9}
@@ -71,7 +71,7 @@ def test_json_has_the_figures_by_the_names_of_require(two, compared):
 
 
 def test_compares_sets_of_evaluations(write, compare, compared):
-    """A shell expands `runs/a* --against runs/b*` to such arguments."""
+    """These are the arguments to which a shell expands `runs/a* --against runs/b*`."""
     a = [write(f"a{k}", {WALK: [[float(k)] * 2]}) for k in range(3)]
     b = [write(f"b{k}", {WALK: [[k + 2.5] * 2]}) for k in range(3)]
     fields = compared(*a, "--against", *b)
@@ -97,7 +97,7 @@ def test_compares_sets_of_evaluations(write, compare, compared):
     ],
 )
 def test_unmet_requirement_fails_with_reason(required, reason, two, compare, compared):
-    """A figure is of all tasks, of each or of one, or the end of an interval."""
+    """Requirements can be about all tasks, each task, one task or an interval's end."""
     status = 0 if reason is None else 1
     requirement = ("--require", required)
     last = compare(*two, *requirement, status=status).out.splitlines()[-1]
@@ -147,7 +147,7 @@ def test_no_worse_than_needs_an_interval_within_the_margin(two, compare):
 
 @pytest.mark.parametrize("returns", [[None, 900.0], [math.nan, 900.0], [None, None]])
 def test_failed_episodes_and_nan_meet_no_requirement(returns, write, compare):
-    """Without figures the status is always 1."""
+    """If there are no figures to compare, the status is always 1."""
     a, b = write("a", {WALK: [[1.0, 2.0]]}), write("b", {WALK: [returns]})
     compare(a, b, "--require", "difference > 0", status=1)
     has_figures, is_nan = returns == [None, 900.0], returns[0] is not None
@@ -158,7 +158,7 @@ def test_failed_episodes_and_nan_meet_no_requirement(returns, write, compare):
 
 
 def test_text_of_files_has_no_effect_on_the_terminal(write, compare):
-    """Neither escape sequences nor rich's markup work."""
+    """Neither escape sequences nor the markup of rich have an effect."""
     a = write("a", {"[red]\x1b[2Jx": [[1.0, 2.0]]}, policy="[bold]\x1b[2J")
     out = compare(a, a).out
     assert "\x1b" not in out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Engines and cameras as options of the command line."""
+"""Test engines and cameras as command-line options."""
 
 import pytest
 from recordings import metadata_of
@@ -45,7 +45,7 @@ def test_contradicting_engine_options_are_one_error(options, words):
 
 
 def test_camera_is_a_name_a_number_or_json(tmp_path, command):
-    """`evaluate` names the command that renders a JSON camera."""
+    """`evaluate` accepts no JSON camera, but names the command that renders one."""
     assert [camera_of(text) for text in ("side", "-1", None)] == ["side", -1, None]
     for text, words in [
         ('{"distance": 3', "--camera must be a JSON object"),

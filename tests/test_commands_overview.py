@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Help, examples and completion of the command line."""
+"""Test the help, examples and completion of the command line."""
 
 import re
 import subprocess
@@ -15,7 +15,7 @@ from report_recordings import entry, write_journal
 
 @pytest.fixture
 def text_of(capsys):
-    """Return a function that runs the command and returns all its output."""
+    """Return a function that runs `mjrec` and returns all of its output."""
 
     def run(*arguments, status=0):
         with pytest.raises(SystemExit) as left:
@@ -36,7 +36,7 @@ def test_help_lists_all_commands_in_24_lines_of_80_columns(text_of):
     assert {*listed} == {*COMMANDS}
 
 
-# The five most used options.
+# These are the five most-used options of each command.
 FIRST = {
     "record": "--out --episodes --policy --seed --size",
     "render": "--episode --camera --size --quality --workers",
@@ -48,18 +48,18 @@ FIRST = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_lists_the_most_used_options_first(command, text_of):
-    """An optional option is `--seed INT`, without Python's None."""
+    """Optional values are shown as `--seed INT`, without Python's `None`."""
     text = text_of(command, "--help")
     assert f"usage: mjrec {command}" in text
     assert not re.search(r"\bNone\b|\(default: (False)?\)", text)
     if command in FIRST:
-        # The list follows -h; lines of prose before it may begin with an option.
+        # Skip the text before -h, where a line may also start with an option.
         listed = text[text.index("-h, --help") :]
         option = r"^\W*?(?:-\w(?: [A-Z]+)?, )?(--[\w-]+)"
         options = re.findall(option, listed, re.MULTILINE)
         assert options[1:6] == FIRST[command].split()
     if command == "record":
-        # Descriptions break only at the margin.
+        # Descriptions are wrapped only at the margin.
         words = " ".join(text.replace("│", " ").split())
         assert "Default: the environment's limit, or 1000" in words
 
@@ -74,7 +74,7 @@ def test_command_without_arguments_shows_examples_with_status_2(command, text_of
 
 
 def test_mjrec_alone_lists_recordings_here_and_below(text_of, tmp_path, monkeypatch):
-    """Without any it shows the commands."""
+    """If there are no recordings, `mjrec` shows its commands."""
     monkeypatch.chdir(tmp_path)
     assert "record  " in text_of(status=2)
     first, second = tmp_path / "runs" / "first", tmp_path / "second"
@@ -97,7 +97,7 @@ def test_unknown_option_is_status_2(text_of):
     text_of("record", "HalfCheetah-v5", "--no-such-option", status=2)
 
 
-# Takes more than five seconds: the script has the options of all commands.
+# Takes more than five seconds: it collects the options of all commands.
 def test_bash_completes_commands_and_options(text_of):
     script = text_of("completion", "bash")
 

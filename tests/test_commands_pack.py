@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output and options of `mjrec pack`."""
+"""Test the output and options of `mjrec pack`."""
 
 import hashlib
 import json

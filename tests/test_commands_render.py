@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output and exit status of `mjrec render`."""
+"""Test the output and exit status of `mjrec render`."""
 
 import functools
 import json
@@ -98,7 +98,7 @@ def test_another_view_makes_new_files_and_changes_none(tmp_path, render, painter
 
 
 def test_variants_have_distinct_names():
-    """Even if a camera has the name of a quality, a size or a rate."""
+    """Names are distinct even if a camera is named like a quality, size or rate."""
     cameras = ["side", 0, "draft", "64x32", "max10fps", "10fps", "camera-draft"]
     views = [View(quality="draft"), View(width=64, height=32)]
     views += [View(camera=camera) for camera in cameras]

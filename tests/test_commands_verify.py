@@ -30,14 +30,14 @@ def test_honest_run_passes_with_a_line_per_topic_and_a_page(packed, tmp_path, co
 
 
 def test_sample_is_partly_verified_with_status_3(packed, command):
-    """The sample is random, and its seed is printed."""
+    """The sample is random, so its seed is printed."""
     out = command("verify", packed, "--sample", 2, "--verbose", status=3).out
     assert out.startswith("PARTLY")
     assert "--seed" in out
 
 
 def test_forged_run_fails_with_status_1(packed, tmp_path, command):
-    """The output names the difference, without escape sequences."""
+    """The output names the changed file and contains no escape sequences from it."""
     bag = unpacked(packed, tmp_path / "bag")
     the(bag, "README.md").write_text("new \x1b[31m[bold]words")
     make_bag_fit(bag)
@@ -74,7 +74,7 @@ def test_verifying_recordings_writes_nothing_into_them(pendulums, tmp_path, comm
     ],
 )
 def test_errors_are_one_message_and_status_1(arguments, message, tmp_path, command):
-    """Options are checked before anything is unpacked."""
+    """Options are checked before the archive is unpacked."""
     path = tmp_path / "run.zip"
     path.write_bytes(b"PK\x03\x04")
     out, err = command("verify", path, *arguments, status=1)

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A confined process sees, writes and reaches only its files."""
 
 from pathlib import Path
 
@@ -33,7 +32,7 @@ say(
 
 
 def test_confined_process_reaches_only_its_files(tmp_path, monkeypatch):
-    """It sees no token, network or real home, and keeps what drawing needs."""
+    """The process sees no token, network or real home, but can still render."""
     folders = {name: tmp_path / name for name in ("readable", "other", "place")}
     for folder in (*folders.values(), tmp_path / "modules"):
         folder.mkdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`pack` rejects what it cannot pack, and leaves nothing then."""
+"""Test that `pack` rejects what it cannot pack and then leaves no files."""
 
 import json
 import shutil
@@ -26,13 +26,13 @@ def recorded(pendulums):
 
 @pytest.fixture
 def directory(recorded, tmp_path):
-    """Return a copy of the recordings, for tests to damage."""
+    """Return a copy of the recordings that tests may damage."""
     return shutil.copytree(recorded, tmp_path / "runs")
 
 
 @pytest.fixture
 def place(tmp_path):
-    """Return the path of an archive; after the test, its folder is empty."""
+    """Return a path for an archive; its folder must be empty after the test."""
     folder = tmp_path / "place"
     folder.mkdir()
     yield folder / "run.zip"
@@ -41,14 +41,14 @@ def place(tmp_path):
 
 @pytest.fixture
 def live(tmp_path, make_corridor, play):
-    """Return recordings of one episode with a live video."""
+    """Return the recording of one episode with a live video."""
     with mjrec.Monitor(make_corridor(), tmp_path / "runs") as env:
         play(env, 1)
     return tmp_path / "runs"
 
 
 def refusal(kind, directory, path, **options):
-    """Return the message of the error that packing raises."""
+    """Check that packing raises exactly this error, and return its message."""
     with pytest.raises(kind) as caught:
         mjrec.pack(directory, path, **options)
     assert type(caught.value) is kind
@@ -97,7 +97,7 @@ def lead_out(directory):
     ("spoil", "kind", "part"),
     [
         (add_a_stray_video, mjrec.UnfinishedRecordings, "openaigym.video.9.x.*manifes"),
-        # Its video counts as pending.
+        # A missing deferred video counts as pending.
         (remove("*000000.mp4"), mjrec.UnfinishedRecordings, "mjrec render .*runs"),
         (remove("*.stats.json"), mjrec.UnfinishedRecordings, "results are missing"),
         (damage_a_trajectory, mjrec.UnreadableFile, "000001.h5"),
@@ -111,7 +111,7 @@ def test_damaged_recordings_are_rejected(directory, place, spoil, kind, part):
 
 
 def test_live_videos_must_exist_and_are_never_encoded_again(live, place):
-    """There is nothing to draw them from."""
+    """No states were recorded from which to render a live video again."""
     video = the(live, "*.mp4")
     content = video.read_bytes()
     message = refusal(mjrec.ArchiveTooLarge, live, place, max_size=1000)
@@ -168,13 +168,13 @@ def test_invalid_options_are_rejected(options, part, recorded, place):
     assert part in refusal(mjrec.InvalidArgument, recorded, place, **options)
 
 
-def test_unknown_episodes_are_named_with_the_known(recorded, place):
+def test_error_for_unknown_episodes_lists_the_valid_ones(recorded, place):
     message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
     assert message.endswith("with the number 9. Available: 0, 1.")
 
 
 def test_authors_licenses_and_sizes_are_parsed():
-    """Names in both orders, licenses as URLs, sizes with units."""
+    """Names may have either order, licenses may be URLs, and sizes may have units."""
     authors = ["Plato", "Ludwig van Beethoven <L@b.de>", "van Beethoven, Ludwig"]
     stated = state(title="t", authors=authors, license="https://x.y/l")
     assert [(a.given, a.family, a.email) for a in stated.authors] == [
@@ -200,7 +200,7 @@ def test_full_disk_is_an_error_and_leaves_nothing(recorded, place):
 
 @pytest.mark.usefixtures("no_process_is_left")
 def test_ctrl_c_leaves_no_file_and_no_process(recorded, tmp_path, place):
-    """Here while it renders smaller videos."""
+    """The interruption comes while `pack` renders smaller videos."""
     size = mjrec.pack(recorded, tmp_path / "run.zip").stat().st_size
 
     def interrupt(progress):
@@ -212,7 +212,7 @@ def test_ctrl_c_leaves_no_file_and_no_process(recorded, tmp_path, place):
 
 
 def test_too_large_archives_are_rejected_with_the_largest_files(recorded, place):
-    """Nothing is rendered if an archive without videos would be too large."""
+    """Nothing is rendered if the archive would be too large even without videos."""
     reports = []
     with pytest.raises(mjrec.ArchiveTooLarge) as caught:
         mjrec.pack(recorded, place, max_size=1000, on_progress=reports.append)
@@ -227,7 +227,7 @@ def test_too_large_archives_are_rejected_with_the_largest_files(recorded, place)
 
 @parametrize("case", ["0.7.4/plain", "0.21.0/two_monitors", "0.12.1/text"])
 def test_recordings_of_gym_are_packed_and_verified(case, tmp_path):
-    """Their episodes cannot be selected."""
+    """Selecting episodes of gym's recordings is an error."""
     directory = Path(__file__).parent / "data/gym" / case
     archive = mjrec.pack(directory, tmp_path / "run.zip")
     assert mjrec.verify(archive, level="files").failures == ()
@@ -236,7 +236,7 @@ def test_recordings_of_gym_are_packed_and_verified(case, tmp_path):
 
 
 def test_names_with_a_percent_sign_use_an_older_bagit_version(tmp_path):
-    """`bagit` and sha512sum read such names there."""
+    """Version 1.0 would write %25, which `bagit` and `sha512sum` do not decode."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data/video.front%2Fleft.mp4").write_bytes(b"1")
     make_bag(tmp_path, date="2026-11-24", title="Recordings")
@@ -246,7 +246,7 @@ def test_names_with_a_percent_sign_use_an_older_bagit_version(tmp_path):
 
 
 def test_anonymous_archives_name_no_author(recorded, tmp_path):
-    """An author in the title is an error."""
+    """If the title names an author, packing fails."""
     options = {"anonymous": True, "authors": ["Zebulon Quackenbush"]}
     archive = mjrec.pack(recorded, tmp_path / "a.zip", **options)
     folder = unpacked(archive, tmp_path / "x")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The official validator accepts packed runs as RO-Crates."""
+"""Test that the official validator accepts packed runs as RO-Crates."""
 
 import json
 import os

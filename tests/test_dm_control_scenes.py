@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dm_control environments: scenes, obstacles, and resets without OpenGL."""
+"""Test dm_control scenes, obstacles to rendering them, and resets without OpenGL."""
 
 import json
 
@@ -30,7 +30,7 @@ def load(domain="cheetah", task="run", **kwargs):
 
 
 def begun(env, directory, **asked):
-    """Return the facts of the scene of a new episode."""
+    """Return the facts about the scene at the start of an episode."""
     states = dm_control_scenes(env, **asked).states
     states.open(directory)
     with states.resetting():
@@ -43,7 +43,7 @@ def begun(env, directory, **asked):
 
 
 def test_scene_equals_that_of_physics_render(tmp_path):
-    """A large frame or a camera object uses another scene."""
+    """For large frames or a camera object, dm_control uses another scene."""
     scene = begun(load(), tmp_path)
     assert (scene["height"], scene["width"], scene["label"]) == (240, 320, -1)
     assert (scene["fresh"], scene["max_geom"]) == (True, 1000)
@@ -71,7 +71,7 @@ def test_overridden_render_of_physics_is_an_obstacle():
 
 
 def test_environment_facts_suffice_to_make_it_again():
-    """They include the state of the random generator."""
+    """The facts include the state of the random generator."""
 
     class Opaque:
         __slots__ = ()
@@ -114,8 +114,8 @@ def rat_in_a_bowl():
 
 @pytest.mark.parametrize("make", [lambda: load("quadruped", "escape"), rat_in_a_bowl])
 def test_terrain_is_made_without_opengl(make, monkeypatch):
-    """A reset asks for the context, which a recorded reset replaces."""
-    # As with MUJOCO_GL=disable.
+    """A reset requires an OpenGL context, which `ContextsOnDemand` replaces."""
+    # This has the same effect as MUJOCO_GL=disable.
     monkeypatch.setattr(_render, "Renderer", _render._no_renderer())
     env = make()
     contexts = ContextsOnDemand(env)

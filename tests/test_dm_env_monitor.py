@@ -10,13 +10,13 @@ import mjrec
 
 dm_env = pytest.importorskip("dm_env", reason="dm_env comes with dm_control")
 
-from dm_env import specs, test_utils  # noqa: E402  after importorskip
+from dm_env import specs, test_utils  # noqa: E402  needs importorskip
 
 pytestmark = pytest.mark.dm_control
 
 
 class Countdown(dm_env.Environment):
-    """Counts `length` steps down; a discount of 0 terminates."""
+    """An environment of `length` steps that ends with `discount`."""
 
     def __init__(self, length=3, discount=0.0):
         self.length = length
@@ -54,7 +54,7 @@ def zeros(env):
 
 
 class ContractTest(test_utils.EnvironmentTestMixin, absltest.TestCase):
-    """The conformance test of dm_env, applied to the monitor."""
+    """Apply dm_env's conformance test to the monitor."""
 
     def make_object_under_test(self):
         directory = tempfile.TemporaryDirectory()
@@ -73,7 +73,7 @@ def test_step_resets_before_the_first_and_after_the_last_step(tmp_path):
             env.step(zeros(env))
     assert env.get_episode_lengths() == [3, 3]
     assert env.get_episode_rewards() == [1.5, 1.5]
-    # After close, calls reach the environment, which was closed once.
+    # A closed monitor still forwards calls, but closes the environment only once.
     env.close()
     assert inner.closed == 1
     assert env.step(zeros(env)).first()
@@ -82,7 +82,7 @@ def test_step_resets_before_the_first_and_after_the_last_step(tmp_path):
 
 @pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
 def test_early_resets_are_allowed_unless_forbidden(tmp_path, discount, terminated):
-    """The last discount tells termination from truncation."""
+    """The last discount distinguishes termination from truncation."""
     inner = Countdown(discount=discount)
     with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
         env.reset()

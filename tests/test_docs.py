@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README, pages and examples agree with the program, and the site builds."""
+"""Test that the documentation and the examples agree with the program."""
 
 import os
 import re
@@ -31,7 +31,7 @@ def blocks(text, language):
 
 
 def run(*command, cwd):
-    """Run a command, which finds `mjrec` beside this Python."""
+    """Run a command that finds `mjrec` next to this Python."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = {**os.environ, "PATH": path}
     done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True)
@@ -53,7 +53,7 @@ def test_texts_stay_within_their_word_limits():
     assert README.count("![") == 1
 
 
-# Takes more than five seconds: it draws the README's 480x480 frames in software.
+# Takes more than five seconds: it renders 480x480 frames in software.
 def test_readme_program_leaves_the_files_that_readme_shows(tmp_path):
     [code], [tree] = blocks(README, "python"), blocks(README, "text")
     run(sys.executable, "-c", code, cwd=tmp_path)
@@ -96,7 +96,7 @@ def tutorial_commands():
 
 
 def normalized(text):
-    """Return the lines without values that differ between machines."""
+    """Return the lines without the values that differ between machines."""
     text = re.sub(r"\.0\.\d+\.video", ".0.4711.video", text)
     text = re.sub(r"-?\d+\.\d+(e-\d+)?", "#", text)
     text = re.sub(r"sha256 [0-9a-f]{64}", "sha256 #", text)
@@ -115,7 +115,7 @@ def test_tutorial_shows_what_its_commands_print(tmp_path):
     for command, output in tutorial_commands():
         printed = run("bash", "-c", command, cwd=tmp_path)
         found = normalized(printed.replace(str(tmp_path), "/home/ada"))
-        # `...` stands for any lines.
+        # In the tutorial, `...` stands for any number of lines.
         shown = "".join(
             r"(?:.*\n)*" if line == "..." else re.escape(line) + "\n"
             for line in normalized(output)
@@ -207,7 +207,7 @@ def test_shell_example_runs_and_is_listed(tmp_path):
 @pytest.mark.thorough
 @pytest.mark.dm_control
 def test_workflow_records_what_it_uploads(tmp_path):
-    """It installs packages and extras that exist."""
+    """The packages and extras that the workflow installs exist."""
     workflow = yaml.safe_load((ROOT / "examples" / "ci" / "record.yml").read_text())
     [job] = workflow["jobs"].values()
     commands = [step["run"] for step in job["steps"] if "run" in step]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec doctor`: its text, its JSON and its exit status."""
+"""Test the text, JSON and exit status of `mjrec doctor`."""
 
 import dataclasses
 import importlib.metadata
@@ -42,7 +42,7 @@ def run_doctor(*arguments, **variables):
     )
 
 
-# Takes more than five seconds: each backend draws in its own process.
+# Takes more than five seconds: each backend renders in its own process.
 def test_json_describes_a_machine_that_renders():
     healthy = run_doctor("--json")
     assert healthy.returncode == 0, healthy.stderr
@@ -68,7 +68,7 @@ def test_json_describes_a_machine_that_renders():
     extras = {extra["name"]: extra for extra in facts["extras"]}
     assert extras["SciPy"]["version"] == importlib.metadata.version("scipy")
     assert {"Slurm", "Ray", "submitit", "Dask", "report", "GPU"} < extras.keys()
-    # Scripts read these keys: add new ones, rename none.
+    # Scripts read these keys, so new ones may be added but none renamed.
     assert list(facts) == [
         *("can_render", "backend", "reason", "backends", "problems"),
         *("gpu_device_files", "ffmpeg", "packages", "extras", "cpus"),
@@ -95,7 +95,7 @@ def test_status_is_1_where_rendering_is_off():
 
 LLVMPIPE = EglDevice(0, "/dev/dri/renderD128", 3, True, True)
 MESA = {"gl_renderer": "llvmpipe (LLVM 15.0.6)", "gl_version": "4.5 Mesa [22.3.6]"}
-# A machine with a bit of everything.
+# This report has at least one entry of every kind.
 REPORT = MachineReport(
     can_render=True,
     backend="egl",
@@ -125,7 +125,7 @@ def shown(report):
 
 
 def test_text_has_each_fact_once_and_whole_commands():
-    """Brackets are no markup."""
+    """Brackets in the text are not treated as markup."""
     text = shown(REPORT)
     lines = [line.rstrip() for line in text.splitlines()]
     assert f"    {_APT}" in lines
@@ -155,7 +155,7 @@ def test_text_has_each_fact_once_and_whole_commands():
     ("refused", "message"),
     [
         ("libx264", "Unknown encoder 'libx264'"),
-        # It tries the options of recordings, not only H.264.
+        # The check uses the encoder options of recordings, not only H.264.
         ("cpu-independent=1", "Error parsing option cpu-independent"),
     ],
 )
@@ -191,7 +191,7 @@ def test_unusable_ffmpeg_has_cause_and_fix(refused, message, tmp_path, monkeypat
     ],
 )
 def test_failing_package_has_a_cause_and_a_fix(program, cause, fix):
-    """Even if its import crashes."""
+    """Cause and fix are given even if importing the package crashes."""
     lacking = examine_package("mjrec-there-is-no-such", "import nothing", "pip get x")
     assert (lacking.version, lacking.works) == (None, None)
     assert "pip get x" in lacking.fix

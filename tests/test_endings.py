@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings say how they ended, and exceptions pass unchanged."""
+"""Test that recordings say how they ended and that exceptions are not changed."""
 
 import signal
 
@@ -14,7 +14,7 @@ from mjrec.recorder.endings import ending
 
 
 class Breaking(gymnasium.Wrapper):
-    """Raises `error` in the next step or reset."""
+    """A wrapper that raises `error` in the next step or reset."""
 
     error = None
 
@@ -39,7 +39,7 @@ def pendulum(steps=None):
 
 @pytest.fixture(params=["live", "deferred"])
 def monitored(request, tmp_path):
-    """Return a pendulum that raises on demand, and its monitor."""
+    """Return a pendulum that raises errors on demand, and its monitor."""
     env = Breaking(pendulum())
     options = {"render": request.param, "workers": 1, "allow_early_reset": True}
     return env, Monitor(env, tmp_path, lambda _: True, **options)
@@ -51,7 +51,7 @@ def steps(monitor, count):
 
 
 def test_failing_step_ends_its_episode_unless_it_goes_on(monitored, tmp_path):
-    """The video keeps its frames and the exception."""
+    """The video keeps its frames, and its metadata contains the exception."""
     env, monitor = monitored
     for seed in range(2):
         monitor.reset(seed=seed)
@@ -60,7 +60,7 @@ def test_failing_step_ends_its_episode_unless_it_goes_on(monitored, tmp_path):
         with pytest.raises(ValueError, match="unstable") as caught:
             steps(monitor, 1)
         assert caught.value is error
-    # The second episode goes on, so nothing is wrong with it.
+    # The second episode continues after the exception, so it is not marked as failed.
     steps(monitor, 2)
     monitor.close()
     metadata = metadata_of(tmp_path, 0)
@@ -123,7 +123,7 @@ for seed in range(2):
         ("raise OverflowError('too far')", 1, "exception"),
         ("sys.exit(7)", 7, "close"),
         ("", 0, "close"),
-        # Python ignores exceptions of finalizers, and no second SIGTERM comes.
+        # Python ignores exceptions in finalizers, and no second SIGTERM follows.
         (
             "class Last:\n"
             "    def __del__(self): os.kill(os.getpid(), signal.SIGTERM)\n"
@@ -134,7 +134,7 @@ for seed in range(2):
     ],
 )
 def test_program_closes_its_files_however_it_ends(code, status, reason, tmp_path):
-    """It renders nothing, and names the pending videos."""
+    """The program renders nothing while it exits, but reports the pending videos."""
     done = run_python(PROGRAM + code, tmp_path, status=status)
     assert done.stderr.count("2 videos pending: mjrec render") == 1
     assert len(stats_of(tmp_path)["episode_lengths"]) == 1
@@ -155,7 +155,7 @@ def test_full_disk_at_exit_prints_no_traceback(tmp_path):
 
 
 def test_ignored_hangup_stays_ignored(tmp_path):
-    """`nohup` asks for it; SIGTERM still closes the files."""
+    """`nohup` ignores SIGHUP; SIGTERM must still close the files."""
     code = (
         "os.kill(os.getpid(), signal.SIGHUP)\n"
         "print('still here', flush=True)\n"
@@ -172,7 +172,7 @@ def test_ignored_hangup_stays_ignored(tmp_path):
     "moment", ["states.StateRecorder.end", "recorder.Recorder._end_episode"]
 )
 def test_episode_interrupted_at_its_end_is_recovered(moment, tmp_path, monkeypatch):
-    """Ctrl-C comes while its end is recorded."""
+    """Ctrl-C arrives while the monitor records the end of the episode."""
     monitor = Monitor(pendulum(3), tmp_path, lambda _: True, workers=0)
     monitor.reset(seed=0)
     steps(monitor, 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments from names, and Gymnasium's own."""
+"""Test environments made from names, including Gymnasium's own."""
 
 import sys
 
@@ -33,7 +33,7 @@ def named(name, **options):
 
 
 def trajectory(made, seeds, *, steps=10):
-    """Return the observations of an episode's first steps with random actions."""
+    """Return the observations of the first steps with random actions."""
     policy = load_policy("random", made.environment)
     policy.reset(seeds)
     observations = [made.begin_episode(made.environment, seeds)]
@@ -48,7 +48,7 @@ def trajectory(made, seeds, *, steps=10):
     "name", ["HalfCheetah-v5", "dm_control/cheetah-run", "A B.MJCF"]
 )
 def test_episode_depends_only_on_its_seeds(name, tmp_path, monkeypatch):
-    """Earlier episodes make no difference."""
+    """An episode does not depend on earlier episodes."""
     if name.startswith("dm_control/"):
         pytest.importorskip("dm_control")
     monkeypatch.chdir(tmp_path)
@@ -68,14 +68,14 @@ def test_environment_and_actions_have_separate_seeds():
     begun, drawn = [], []
     for each in (seeds, seeds, same_start):
         begun.append(made.begin_episode(made.environment, each).tolist())
-        # A user's policy may sample the action space too.
+        # A user's policy may sample from the action space too.
         drawn.append(made.environment.action_space.sample().tolist())
     assert begun[0] == begun[1] == begun[2]
     assert drawn[0] == drawn[1] != drawn[2]
 
 
 def test_begin_seeds_once_as_gymnasium_users_do():
-    """They call `reset(seed=...)`, then `reset()` and `reset()`."""
+    """Gymnasium users pass a seed only to the first `reset`."""
     made = named("InvertedPendulum-v5", frames=False)
     theirs = gymnasium.make("InvertedPendulum-v5")
     expected = [theirs.reset(seed=4)[0], theirs.reset()[0]]
@@ -99,7 +99,7 @@ def test_invalid_seeds_are_rejected(bad):
 
 
 def test_module_may_be_in_the_working_directory(tmp_path, monkeypatch, registered):
-    """`module:Id` imports it first, and a failing import is one error."""
+    """`module:Id` imports the module first, and a failing import is a single error."""
     (tmp_path / "mjrec_test_envs.py").write_text(
         "import gymnasium, conftest\n"
         "gymnasium.register('Local-v0', lambda **k: conftest.Corridor(**k))\n"
@@ -138,14 +138,14 @@ def missing(**kwargs):
 
 @pytest.fixture
 def registered(monkeypatch):
-    """Register environments for one test."""
+    """Register environments for the duration of a test."""
     monkeypatch.setattr(gymnasium.envs.registration, "registry", {**gymnasium.registry})
     for env_id, entry_point in {
         "Corridor-v0": Corridor,
         "OnlyText-v0": OnlyText,
         "OnlyWindow-v0": OnlyWindow,
         "NoCamera-v0": NoCamera,
-        # Its render modes are unknown until it is called.
+        # The render modes of a function are unknown until it is called.
         "Made-v0": lambda render_mode=None: Corridor(render_mode=render_mode),
         "Blind-v0": lambda render_mode=None: Corridor(render_mode=None),
         "Missing-v0": missing,
@@ -160,7 +160,7 @@ def registered(monkeypatch):
         ("Corridor-v0", None, {}, 1000),
         ("Corridor-v0", 3, {}, 3),
         ("Short-v0", 9, {}, 4),
-        # Gymnasium's own name for it, with -1 for no limit.
+        # Gymnasium's own name for the limit also works, with -1 for no limit.
         ("HalfCheetah-v5", None, {"max_episode_steps": 6}, 6),
         ("Short-v0", None, {"max_episode_steps": -1}, 1000),
     ],
@@ -174,7 +174,7 @@ def test_step_limit_is_smallest_or_1000(registered, env_id, asked, kwargs, expec
     ("env_id", "kwargs", "mode", "text"),
     [
         *(("OnlyText-v0", {}, "ansi", "o\n"), ("Made-v0", {}, "rgb_array", "")),
-        # A name without a version means the latest.
+        # A name without a version means the latest version.
         ("FrozenLake", {"render_mode": "ansi"}, "ansi", "FHFH"),
     ],
 )
@@ -191,12 +191,12 @@ def test_render_mode_is_requested_or_available(registered, env_id, kwargs, mode,
         ("HalfCheetah-v5", {}, "track"),
         ("HalfCheetah-v5", {"camera": -1}, -1),
         ("HalfCheetah-v5", {"kwargs": {"camera_id": -1}}, -1),
-        # It takes no camera, like those of Gymnasium-Robotics.
+        # This environment takes no camera, like those of Gymnasium-Robotics.
         ("NoCamera-v0", {}, "track"),
     ],
 )
 def test_default_camera_follows_the_robot(registered, env_id, options, camera):
-    """Gymnasium 1.4's default camera, -1, does not."""
+    """The default camera of Gymnasium 1.4, -1, does not follow the robot."""
     base = make(env_id, **options).unwrapped
     shown = base.mujoco_renderer.camera_id
     assert camera == (-1 if shown == -1 else base.model.camera(shown).name)
@@ -208,13 +208,13 @@ WRONG = [
     ("dm_control/cheetah", {}, InvalidArgument, "dm_control/<domain>-<task>"),
     ("./robot.txt", {}, InvalidArgument, r"\.xml or \.mjcf"),
     ("robto.xml", {}, mjrec.UnknownName, r"MJCF file .*Available: .*robot.xml"),
-    # Similar names ignore versions; without any, the error explains names.
+    # Suggestions ignore versions; if there are none, the error explains valid names.
     ("halfcheeta-v9", {}, mjrec.UnknownName, CHEETAH),
     ("zz/zzz-v0", {}, mjrec.UnknownName, r"colon.*dm_control/<domain>"),
     ("no_such_module:X-v0", {}, mjrec.EnvironmentNotMade, "no_such_module"),
-    # Errors of a constructor become one error.
+    # An error in a constructor is reported as a single error.
     (CHEETAH, {"kwargs": {"foo": 1}}, mjrec.EnvironmentNotMade, f"{CHEETAH}.*'foo'"),
-    # Gymnasium's own message has the commands between backticks.
+    # Gymnasium's own message has the commands in backticks.
     (
         *("Missing-v0", {}, mjrec.MissingDependency),
         r"Missing-v0 needs no_such_engine.*install swig && pip install engine",
@@ -226,7 +226,7 @@ WRONG = [
     (CHEETAH, {"camera": 3}, InvalidArgument, "Camera number 3"),
     ("Corridor-v0", {"camera": "track"}, InvalidArgument, "has no cameras"),
     ("Corridor-v0", {"height": 9, "width": 9}, InvalidArgument, "takes no size"),
-    # The modes there are, the modes it takes, and the way out.
+    # The error names the environment's modes, the usable modes and a way out.
     ("OnlyWindow-v0", {}, mjrec.NoPictures, r"\['human'\].*rgb_array.*none"),
     ("Blind-v0", {}, mjrec.NoPictures, "ignored render_mode"),
     (CHEETAH, {"kwargs": {"render_mode": None}}, mjrec.NoPictures, "was requested"),
@@ -241,13 +241,13 @@ WRONG = [
 def test_invalid_requests_name_the_valid_ones(
     tmp_path, monkeypatch, registered, name, options, kind, words
 ):
-    """They fail before any episode begins."""
+    """Invalid requests fail before an episode starts."""
     monkeypatch.chdir(tmp_path)
     for file_name in ("robot.txt", "robot.xml"):
         (tmp_path / file_name).write_text("<mujoco/>")
 
     def begin():
-        # Some environments are made without frames.
+        # Some invalid requests still make an environment, though without frames.
         if (refusal := named(name, **options).not_drawn) is not None:
             raise refusal
 
@@ -257,7 +257,7 @@ def test_invalid_requests_name_the_valid_ones(
 
 
 def test_missing_pygame_is_reported_before_the_first_episode(monkeypatch):
-    """The error has the command, and names text where the environment has it."""
+    """The error has the command to run, and suggests text where that is available."""
     monkeypatch.setitem(sys.modules, "pygame", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(mjrec.MissingDependency, match=r"gymnasium\[classic-control\]"):

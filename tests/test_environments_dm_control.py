@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dm_control's environments from names."""
+"""Test dm_control environments made from names."""
 
 import numpy as np
 import pytest
@@ -19,13 +19,13 @@ from mjrec.environments.named_environment import is_terminated, is_truncated
 
 
 def named(task, **options):
-    """Return a task by its name, by default without frames."""
+    """Return the task with this name, by default without frames."""
     made = EnvironmentOptions(**{"frames": False, **options})
     return environment_from_name(f"dm_control/{task}", made)
 
 
 def test_step_limit_is_smallest_or_1000():
-    """All tasks but lqr have their own."""
+    """Every task except lqr has a step limit of its own."""
     assert named("pendulum-swingup", max_steps=5000).step_limit == 1000
     assert named("pendulum-swingup", max_steps=5).step_limit == 5
     assert named("lqr-lqr_2_1").step_limit == 1000
@@ -40,7 +40,7 @@ def test_step_limit_is_smallest_or_1000():
 
 
 def test_seed_determines_random_parts_of_models():
-    """The task lqr draws its springs when it is made."""
+    """The lqr task draws random springs when it is created."""
 
     def springs(seed, **kwargs):
         env = named("lqr-lqr_2_1", seed=seed, kwargs=kwargs).environment
@@ -51,7 +51,7 @@ def test_seed_determines_random_parts_of_models():
 
 
 def test_monitor_knows_the_seed(tmp_path):
-    """dm_env's reset takes none."""
+    """dm_env's `reset` takes no seed, so the monitor must get it in another way."""
     made = named("ball_in_cup-catch")
     with mjrec.Monitor(made.environment, tmp_path, False, env_id="x") as monitor:
         made.begin_episode(monitor, episode_seeds(0, 0))
@@ -115,7 +115,7 @@ def test_unusable_dm_control_is_an_error_with_the_fix(tmp_path, monkeypatch):
     assert 'pip install "mjrec[dm-control]"' in text
 
     def load(*_, **__):
-        # As dm_control 1.0.50 does with mujoco 4.0.
+        # dm_control 1.0.50 raises this error with mujoco 4.0.
         raise AttributeError("'MjModel' object has no attribute 'flex_vertedge'")
 
     monkeypatch.setattr(suite, "load", load)
@@ -124,7 +124,7 @@ def test_unusable_dm_control_is_an_error_with_the_fix(tmp_path, monkeypatch):
 
 
 def test_recorded_arguments_are_those_of_named_tasks():
-    """Those of a user's own environment are unknown."""
+    """The arguments of a user's own environment are unknown."""
     made = {"seed": 5, "max_steps": 3, "kwargs": {"task_kwargs": {"time_limit": 2}}}
     ours = named("cartpole-swingup", **made).environment
     known = {"task_kwargs": {"random": 5, "time_limit": 2}}
@@ -135,7 +135,7 @@ def test_recorded_arguments_are_those_of_named_tasks():
 
 @pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])
 def test_begin_seeds_once_as_users_of_the_suite_do(task):
-    """They seed `suite.load`, then reset and reset."""
+    """Users of the suite pass the seed to `suite.load` and never to `reset`."""
     theirs = suite.load(*task.split("-"), task_kwargs={"random": 7})
     made = named(task, seed=7)
     for episode in range(3):
@@ -144,8 +144,8 @@ def test_begin_seeds_once_as_users_of_the_suite_do(task):
         np.testing.assert_equal(dict(first), dict(theirs.reset().observation))
 
 
-def test_another_seed_begins_anew():
-    """The environment's own seed and earlier episodes make no difference."""
+def test_new_seed_overrides_earlier_state():
+    """A new seed overrides the environment's own seed and earlier episodes."""
     fresh, used = (named("pendulum-swingup", seed=7) for _ in range(2))
     used.environment.reset()
     seeds = episode_seeds(9, 0)

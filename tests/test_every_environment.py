@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors record every environment."""
+"""Test that monitors record every environment."""
 
 import importlib.util
 from fractions import Fraction
@@ -28,7 +28,7 @@ def suite_tasks():
 
 
 def check(name, directory, timestep):
-    """Record an episode, whose video plays in real time and is not blank."""
+    """Check that the video of an episode plays in real time and is not blank."""
     made = EnvironmentOptions(max_steps=3, height=48, width=64)
     session = Session(environment=name, directory=directory, seed=0, made=made)
     [episode] = record_session(session)
@@ -38,7 +38,7 @@ def check(name, directory, timestep):
     expected = Fraction(timestep).limit_denominator(10**6)
     assert Fraction(metadata["timestep"]) == expected
     assert metadata["playback_speed"] == 1.0
-    # Neither black nor of one color.
+    # No frame is black or of a single color.
     assert all(frame.std() > 5 for frame in frames_in(directory, 0))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's fast path records steps as the usual path does."""
+"""Test that the recorder's fast path records the same data as its usual path."""
 
 import itertools
 import os
@@ -23,7 +23,7 @@ CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 
 
 def make(env_id=CHEETAH, steps=8, *, give=None):
-    """Return an environment that allows the fast path; `give` changes its rewards."""
+    """Return an environment that allows the fast path; `give` replaces its rewards."""
     env = gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
     if give is not None:
         env = gymnasium.wrappers.TransformReward(env, lambda r: give(float(r)))
@@ -35,7 +35,7 @@ def trajectories(directory):
 
 
 def monitored(env, directory, schedule=None, **options):
-    """Return a monitor of the environment that draws nothing yet."""
+    """Return a monitor of the environment that leaves its videos pending."""
     if not isinstance(env, gymnasium.Env):
         options |= {"env_id": "dm_control/some-task", "height": 32, "width": 48}
     schedule = (lambda _: True) if schedule is None else schedule
@@ -51,7 +51,7 @@ def begin(monitor):
 
 
 def go(monitor, count, *, fast=True):
-    """Take steps, without the fast path if asked, and return their results."""
+    """Take steps, with or without the fast path, and return their results."""
     results = []
     for number in range(1, count + 1):
         if not fast:
@@ -75,7 +75,7 @@ def recorded(env, directory, *, fast, **options):
 
 
 def dm_control(domain, task, camera, *marks):
-    """Return a case of a dm_control task whose episodes have eight steps."""
+    """Return test parameters for a dm_control task with episodes of eight steps."""
 
     def new():
         suite = pytest.importorskip("dm_control.suite", reason="no dm_control")
@@ -92,7 +92,7 @@ def dm_control(domain, task, camera, *marks):
     ("new", "camera", "max_fps", "frames"),
     [
         (lambda: make(HOPPER), None, None, [*range(9)]),
-        # At most 50 of 125 steps a second are every third one, and the last of all.
+        # A limit of 50 fps at 125 steps per second keeps every third step and the last.
         (lambda: make(HOPPER), None, 50, [0, 3, 6, 8]),
         dm_control("cheetah", "run", None),
         dm_control("cheetah", "run", mujoco.MjvCamera(), pytest.mark.thorough),
@@ -145,20 +145,20 @@ def test_action_shape_and_timestep_may_change_between_episodes(tmp_path):
         np.float32,
         np.array,
         lambda reward: np.array([reward]),
-        # The type changes within an episode.
+        # With this function, the type of the reward changes within an episode.
         lambda reward: reward > 0 if reward > 0 else np.float64(reward),
     ],
     ids=["int", "float32", "0-d", "1-d", "mixed"],
 )
 def test_rewards_of_any_type_become_floats(kind, schedule, tmp_path):
-    """Trajectories have each, and statistics their sum in order."""
+    """Trajectories have each reward, and statistics have their sum, added in order."""
     with monitored(make(give=kind), tmp_path, schedule) as monitor:
         begin(monitor)
         stats, rewards = monitor.stats_recorder, []
         for number in range(1, 9):
             [(_, reward, *_)] = go(monitor, 1)
             rewards.append(float(np.asarray(reward).item()))
-            # Statistics are up to date after every step, as Python's floats.
+            # The statistics are updated after every step and are Python floats.
             assert (stats.steps, stats.total_steps) == (number, number)
             assert (stats.rewards, type(stats.rewards)) == (added_up(rewards), float)
         [total] = monitor.get_episode_rewards()
@@ -169,7 +169,7 @@ def test_rewards_of_any_type_become_floats(kind, schedule, tmp_path):
 
 
 def test_step_with_an_invalid_reward_is_not_recorded(tmp_path):
-    """The next step is, and a monitor closed within a step returns its result."""
+    """Later steps are recorded, and `step` returns if the monitor is closed in it."""
     rewards = iter([1.0, 1.0, "much", 1.0])
 
     def give(reward):
@@ -194,7 +194,7 @@ def test_step_with_an_invalid_reward_is_not_recorded(tmp_path):
 
 
 def test_actions_are_recorded_as_given(tmp_path, caplog):
-    """Types may change, and the environment may overwrite them."""
+    """The types of actions may change, and the environment may overwrite an action."""
 
     class Overwriting(gymnasium.Wrapper):
         def step(self, action):
@@ -212,7 +212,7 @@ def test_actions_are_recorded_as_given(tmp_path, caplog):
         np.linspace(-1, 1, 6).astype(">f4"),
         np.linspace(-1, 1, 12, dtype=np.float32)[::2],
     ]
-    # The first action has integers.
+    # The first action consists of integers.
     actions = [other[3], *itertools.chain(*zip(usual, other, strict=True))]
     expected = np.array(actions, np.float64)
     with monitored(Overwriting(make(steps=len(actions))), tmp_path) as monitor:
@@ -225,7 +225,7 @@ def test_actions_are_recorded_as_given(tmp_path, caplog):
 
 
 def interrupt_in(monitor, call_number):
-    """Take a step and raise after a call in mjrec; return whether it came so far."""
+    """Interrupt a step at a given call in mjrec; return whether it was reached."""
     left = call_number
 
     def profile(frame, event, _):
@@ -245,7 +245,7 @@ def interrupt_in(monitor, call_number):
     return False
 
 
-# Takes more than five seconds: it records an episode per place of an interruption.
+# Takes more than five seconds: it records an episode for each interruption.
 @pytest.mark.parametrize(
     ("max_fps", "schedule"),
     [(None, None), (8, None), (None, False)],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding and running ffmpeg."""
+"""Test finding and running ffmpeg."""
 
 import hashlib
 import os
@@ -41,7 +41,7 @@ def test_binary_has_path_version_hash_and_encoders():
     ("libavutil", "option"), [("56. 70.100", "-vsync"), ("61.  1.102", "-fps_mode")]
 )
 def test_frame_option_depends_on_the_version(libavutil, option, tmp_path, monkeypatch):
-    """5.1 renamed the option, and 9 removed the old name."""
+    """The option was renamed in ffmpeg 5.1, and ffmpeg 9 removed the old name."""
     text = f"printf 'ffmpeg version x\\nlibavutil      {libavutil} / {libavutil}\\n'"
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script(tmp_path / "other", text)))
     assert every_frame_arguments() == (option, "passthrough")
@@ -66,11 +66,11 @@ def test_unstartable_program_is_an_error_with_the_fix(tmp_path, monkeypatch, is_
 
 @pytest.fixture
 def hang_at(tmp_path, monkeypatch):
-    """Replace ffmpeg by a shell script, which hangs after 0.3 s without progress."""
+    """Replace ffmpeg with a shell script, and shorten the timeout to 0.3 s."""
     monkeypatch.setenv("MJREC_TIMEOUT", "0.3")
 
     def run(text):
-        # The shell stays as the parent of its command, like a wrapper script.
+        # The final `exit` keeps the shell as a parent process, like a wrapper script.
         program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
 
@@ -102,7 +102,7 @@ def cmdline(process):
 
 
 def test_slow_process_is_not_killed(tmp_path, hang_at):
-    """Progress is what it reads, prints or writes into its file."""
+    """Reading input, printing and writing to the file all count as progress."""
     out = tmp_path / "out"
     hang_at(
         "for k in 1 2 3 4 5; do head -c 65536 >/dev/null; echo $k; sleep 0.1; done; "
@@ -122,12 +122,12 @@ def test_answers_are_remembered_until_the_program_changes(tmp_path, monkeypatch)
     monkeypatch.setattr(ffmpeg, "ffmpeg_executable", lambda: str(program))
 
     def ask(answer):
-        """Ask as a new process would."""
+        """Ask with an empty cache, like a new process."""
         ffmpeg._answers.clear()
         return remembered("does it work?", lambda: answer)
 
     assert [ask("yes"), ask("no")] == ["yes", "yes"]
-    # Its size and modification time stay.
+    # The new program has the same size and modification time.
     before = program.stat()
     program.write_text("two")
     os.utime(program, ns=(before.st_atime_ns, before.st_mtime_ns))

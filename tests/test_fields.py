@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of models and facts of views, as files name them."""
+"""Test fields of models and facts of views, as they are named in files."""
 
 import mujoco
 import numpy as np
@@ -39,7 +39,7 @@ XML = """
     ],
 )
 def test_invalid_fields_are_rejected(name, value, words):
-    """MuJoCo would read foreign memory at a wrong index."""
+    """With an invalid index, MuJoCo would read memory out of bounds."""
     model = mujoco.MjModel.from_xml_string(XML)
     with pytest.raises(InvalidArgument, match=words):
         apply_fields(model, {name: value}, option=mujoco.MjvOption())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film strips show the right frames with the right times."""
+"""Test that film strips show the right frames and times."""
 
 import json
 import sys
@@ -24,7 +24,7 @@ HEIGHT, WIDTH = 47, 64
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Record an episode of ten steps of 0.05 s, with an odd height."""
+    """Record an episode of ten 0.05 s steps with frames of odd height."""
     directory = tmp_path_factory.mktemp("strip")
     size = {"width": WIDTH, "height": HEIGHT, "max_episode_steps": 10}
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
@@ -39,7 +39,7 @@ def video(recorded):
 
 
 def cells(strip, rows, columns, height=HEIGHT, width=WIDTH):
-    """Cut the frames out of a strip."""
+    """Return the frames of a strip."""
     gap = max(2, round(0.03 * min(height, width)))
     row_height = (strip.shape[0] - gap) // rows
     return [
@@ -51,7 +51,7 @@ def cells(strip, rows, columns, height=HEIGHT, width=WIDTH):
 
 @pytest.fixture
 def labels(monkeypatch):
-    """Return the list of labels under the frames."""
+    """Return a list that receives the labels under the frames."""
     written, labels_of = [], module._labels
 
     def write(seconds):
@@ -75,11 +75,11 @@ def test_frames_of_a_trajectory_are_rendered_from_any_camera(recorded, labels):
 
 
 def test_frames_of_a_video_are_decoded_with_simulated_times(video, labels):
-    """Without the row that made its height even."""
+    """The frames omit the row of padding that makes the video's height even."""
     strip = film_strip(video, frames=6, columns=3)
     decoded = np.array(frames_of(video)[::2])[:, :HEIGHT].astype(int)
     assert np.abs(cells(strip, 2, 3) - decoded).max() <= 2
-    # Margins are white, with labels below the frames.
+    # The margins are white, and the labels are below the frames.
     assert (strip[:2] == 255).all()
     assert (strip[:, :2] == 255).all()
     assert strip[2 + HEIGHT : strip.shape[0] // 2, :, 0].min() < 64
@@ -97,8 +97,8 @@ def test_frames_of_a_video_are_decoded_with_simulated_times(video, labels):
         '{"height": 3, "width": 3, "timestep": "1/20"}',
     ],
 )
-def test_invalid_metadata_leave_the_times_of_the_video(video, tmp_path, text, labels):
-    """Metadata may claim any number of frames."""
+def test_invalid_metadata_does_not_change_the_times(video, tmp_path, text, labels):
+    """Metadata with an impossible number of frames must not be trusted."""
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(video.read_bytes())
     if text is not None:
@@ -146,21 +146,21 @@ def test_unreadable_files_are_errors_with_the_name(video, tmp_path):
 
 @pytest.mark.parametrize("ending", [".mp4", ".avi", ".mkv"])
 def test_exact_frames_of_each_kind_of_video_are_read(tmp_path, ending):
-    """Times of this rate are no round numbers."""
+    """At this frame rate, times are not round numbers."""
     path = tmp_path / f"gray{ending}"
     with mjrec.VideoWriter(path, fps=30) as writer:
         for i in range(40):
             writer.write(np.full((16, 16, 3), 6 * i, np.uint8))
     stream = read_stream(path)
     assert (len(stream), stream.seconds) == (40, pytest.approx(4 / 3, abs=0.01))
-    # More frames than one decoding.
+    # These are too many frames to decode in a single run of ffmpeg.
     indices = [i for i in range(40) if i % 5]
     means = [frame.mean() for frame in frames_at(stream, indices)]
     np.testing.assert_allclose(means, [6 * i for i in indices], atol=2)
 
 
 def test_strip_is_a_png_with_300_dots_per_inch(video, tmp_path):
-    """A failure leaves no file."""
+    """A failed attempt leaves no file."""
     strip = film_strip(video, frames=2)
     with pytest.raises(InvalidArgument, match=r"strip\.png"):
         write_film_strip(tmp_path / "strip.jpg", strip)
@@ -174,7 +174,7 @@ def test_strip_is_a_png_with_300_dots_per_inch(video, tmp_path):
 
 
 def test_command_writes_a_strip_and_prints_its_size(video, tmp_path, capsys):
-    """Impossible requests write nothing."""
+    """An impossible request writes no file."""
     out = tmp_path / "strip.png"
     with pytest.raises(InvalidArgument, match="trajectory"):
         strip(video, size="640x480", out=out)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of others are checked in a sandbox, once per version of a file."""
+"""Test that each version of a foreign recording is checked once in a sandbox."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ from mjrec.simulation.model_trust import directory_digest, note_models
 
 @pytest.fixture
 def started(monkeypatch):
-    """Return the list of modules started in a sandbox."""
+    """Return a list that receives the modules started in a sandbox."""
     modules, real = [], foreign_files.Sandbox
 
     def counted(module, *arguments, **options):
@@ -29,7 +29,7 @@ def started(monkeypatch):
 
 
 def test_foreign_file_is_checked_once_until_it_changes(tmp_path, started):
-    """A log is not checked, because nothing in it is compressed."""
+    """A log is not checked, because it contains no compressed data."""
     mjrec.load_trajectory(write_log(tmp_path, 1))
     assert started == []
     path = finished(tmp_path)
@@ -42,7 +42,7 @@ def test_foreign_file_is_checked_once_until_it_changes(tmp_path, started):
 
 
 def test_own_files_start_no_sandbox(tmp_path, started, monkeypatch):
-    """They contain models of this user's list, wherever they moved."""
+    """A file counts as the user's own if its models are in the user's list."""
     own = tmp_path / "own"
     with mjrec.Monitor(gymnasium.make("InvertedPendulum-v5"), own, workers=0) as env:
         env.reset(seed=1)
@@ -56,7 +56,7 @@ def test_own_files_start_no_sandbox(tmp_path, started, monkeypatch):
     note_models([directory_digest(copy.parent)])
     os.utime(copy, (0, 0))
     mjrec.load_trajectory(copy)
-    # Another user has another list of models.
+    # Another user has a different list of models.
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
     mjrec.load_trajectory(path)
     assert len(started) == 2

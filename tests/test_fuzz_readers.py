@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of damaged files return valid content or one error that names the file.
+"""Test that readers of damaged files return valid content or name the bad file.
 
-Hypothesis derives the damage, the same in each run.
+Hypothesis derives the damage, which is the same in each run.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ FEW = settings(
 )
 
 
-# Values that have broken readers: each is tried in every place.
+# These values have broken readers before, so each is tried in every place.
 BAD_VALUES = [
     *(None, True, 0, 5, -1, 0.5, 10**400, 2**64, -(2**63), 1e308, float("inf")),
     *("", "5", "..", "../x", "a/b", "\ud800", "a" * 300, "1e999999999"),
@@ -55,7 +55,7 @@ BAD_VALUES = [
 
 
 def variants(value):
-    """Yield `value` with each part removed, and replaced by each bad value."""
+    """Yield variants of `value` with a part removed or replaced by a bad value."""
     if isinstance(value, dict | list):
         for key in [*value] if isinstance(value, dict) else range(len(value)):
             changed = copy.copy(value)
@@ -68,7 +68,7 @@ def variants(value):
 
 
 def write_valid(directory):
-    """Write a manifest, statistics, a journal line and metadata."""
+    """Write a valid manifest, statistics, a journal line and metadata."""
     pending = [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}]
     details = {"next_episode_id": 3, "pending": pending, "broken": ["d.meta.json"]}
     videos = [(f"{name}.mp4", f"{name}.meta.json") for name in "ab"]
@@ -80,13 +80,13 @@ def write_valid(directory):
 
 
 def check_manifest(path):
-    """Check that a manifest can be written again and names local files only."""
+    """Check that a manifest can be rewritten and names only local files."""
     manifest = read_manifest(path)
     names = [manifest.stats, *(name for pair in manifest.videos for name in pair)]
     assert all((path.parent / name).parent == path.parent for name in names)
     assert all(len(os.fsencode(name)) <= 255 for name in names)
     write_manifest(path, manifest)
-    # An update uses more of it than reading checks.
+    # An update uses more of the manifest than reading it checks.
     update_manifests(path.parent)
 
 
@@ -178,7 +178,7 @@ def apply_damage(data, damage):
 
 @pytest.fixture(scope="module")
 def valid_log(tmp_path_factory):
-    """The content of a recording's files by name."""
+    """Return the contents of a recording's files by name."""
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
     packed = pack_change(1, ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
@@ -190,7 +190,7 @@ _numbers = itertools.count()
 
 
 def read_log(tmp_path, files):
-    """Return the content, or None after one error that names one of its files."""
+    """Return the content, or None after an error that names one of the files."""
     directory = tmp_path / str(next(_numbers))
     directory.mkdir()
     for name, content in files.items():
@@ -233,11 +233,11 @@ def test_damaged_log_files(tmp_path, valid_log, part, damage):
 @FEW
 @given(damage=DAMAGE, written=st.integers(0, 4))
 def test_damaged_tail(tmp_path, valid_log, damage, written):
-    """Its rows are read as long as their numbers continue."""
+    """Rows in the tail are read as long as their numbers are consecutive."""
     rows = valid_log[LOG]
     size = len(rows) // 5
     head = struct.pack("=QQQ", 5, size // 8, 5)
-    # Half of the damage hits the head, which is short.
+    # The head is short, so aim half of the damage at it.
     placed = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
     tail = apply_damage(head + rows, placed)
     tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports gather their contents from recordings and evaluations."""
+"""Test that reports gather their contents from recordings and evaluations."""
 
 import json
 import os
@@ -26,7 +26,7 @@ from report_recordings import GYM, entry, record, write_journal
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Return recordings of two episodes of six steps, with two cameras."""
+    """Return a recording of two six-step episodes with two cameras."""
     directory = tmp_path_factory.mktemp("my recordings")
     size = {"width": 64, "height": 48, "max_episode_steps": 6}
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
@@ -34,7 +34,7 @@ def recorded(tmp_path_factory):
     return directory
 
 
-# Takes more than five seconds: its fixture records for all tests of this file.
+# Takes more than five seconds: the fixture records for all tests in this file.
 def test_monitor_directory_is_one_task_with_its_videos(recorded):
     contents = gather(recorded)
     [task] = contents.tasks
@@ -67,7 +67,7 @@ def test_video_command_renders_again(recorded, number, command, tmp_path, monkey
 
 @pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir() if p.is_dir()))
 def test_gathers_recordings_of_every_gym_version(version):
-    """It finds directories one level below, and text videos."""
+    """`gather` also finds directories one level down and videos in text form."""
     tasks = {Path(task.source).name: task for task in gather(GYM / version).tasks}
     assert tasks.keys() == {p.name for p in (GYM / version).iterdir()}
     assert tasks["two_monitors"].summary.runs == 2
@@ -79,7 +79,7 @@ def test_gathers_recordings_of_every_gym_version(version):
 
 
 def test_episodes_of_several_monitors_are_sorted_by_time(tmp_path):
-    """An unknown time comes last, and unknown success stays unknown."""
+    """An episode with an unknown time comes last, and unknown success stays unknown."""
     early = [entry(0, end_time=3.0e9, success=True), entry(1)]
     late = [entry(0, end_time=2.0e9, success=False), entry(1, end_time=np.nan)]
     write_journal(tmp_path, "0.a", "X-v0", early)
@@ -93,12 +93,12 @@ def test_episodes_of_several_monitors_are_sorted_by_time(tmp_path):
 
 
 def test_each_environment_of_each_directory_is_a_task(tmp_path):
-    """It reports a directory with several environments."""
+    """A directory with several environments is reported as a problem."""
     a, b = tmp_path / "a", tmp_path / "b"
     write_journal(a, "0.a", "X-v0", [entry(0)])
     write_journal(a, "1.a", "Y-v0", [entry(0), entry(1)])
     write_journal(b, "0.x", "X-v0", [entry(0)])
-    # A directory given twice counts once.
+    # A directory that is given twice counts only once.
     contents = gather([a, b, b / "."])
     tasks = [(task.name, task.summary.episodes) for task in contents.tasks]
     assert tasks == [(f"X-v0 ({a})", 1), ("Y-v0", 2), (f"X-v0 ({b})", 1)]
@@ -120,10 +120,10 @@ def test_damaged_files_are_problems_and_the_rest_is_shown(tmp_path):
 
 @pytest.mark.parametrize("there", ["link", "pipe"])
 def test_links_and_pipes_in_place_of_videos_are_omitted(corridor, tmp_path, there):
-    """A link could put any file of the reader into a report."""
+    """A link could make a report include any file that its reader can access."""
     directory = tmp_path / "run"
     record(corridor, directory, 1)
-    # A live video has no command that renders it.
+    # There is no command that renders a live video again.
     [shown] = gather(directory).videos
     assert shown.command is None
     assert any("live" in note for note in shown.notes)
@@ -158,7 +158,7 @@ def test_invalid_metadata_does_not_hide_the_video(corridor, tmp_path, metadata):
 
 
 def test_evaluation_has_the_results_of_its_files(tmp_path):
-    """Its summaries come from its file, its episodes in the plan's order."""
+    """Summaries are read from the file, and episodes keep the order of the plan."""
     write_recorded(tmp_path / "e", ["a/x", "b/y"])
     write_journal(tmp_path / "m", "0.a", "X-v0", [entry(i) for i in range(20)])
     contents = gather([tmp_path / "e", tmp_path / "m"])
@@ -173,7 +173,7 @@ def test_evaluation_has_the_results_of_its_files(tmp_path):
     assert (task.summary.episodes, task.summary.failed) == (3, 1)
     assert ("Seeds", "0, 7") in task.provenance
     assert ("Versions", "mjrec 9.9, MuJoCo 8.8") in task.provenance
-    # All intervals of a page use one bootstrap.
+    # All intervals on a page use the same bootstrap.
     assert (contents.bootstrap.seed, contents.bootstrap.resamples) == (3, 100)
     [alone] = gather(tmp_path / "m").tasks
     assert contents.tasks[-1].summary.mean_interval != alone.summary.mean_interval
@@ -254,13 +254,13 @@ def test_roles_are_those_of_the_selection_rule(tmp_path, rewards):
 
 
 def verdict(outcome, **fields):
-    """Return the text of a verification with one finding."""
+    """Return the JSON text of a verification with one finding."""
     known = {"path": "run", "level": "physics", "findings": [{"outcome": outcome}]}
     return json.dumps({**known, **fields})
 
 
 def test_verdicts_come_from_the_directory_and_from_given_files(tmp_path):
-    """Noted findings do not count."""
+    """Findings with the outcome `noted` are not counted."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
     found, given = tmp_path / "run" / "verification.json", tmp_path / "other.json"
     outcomes = [{"outcome": each} for each in ("recreated", "believed", "noted")]
@@ -281,7 +281,7 @@ def test_verdicts_come_from_the_directory_and_from_given_files(tmp_path):
     ],
 )
 def test_invalid_verdicts_are_problems(tmp_path, text):
-    """A verdict may contradict itself; a given file is an error."""
+    """An invalid file is a problem if found in a directory, and an error if passed."""
     write_journal(tmp_path, "0.a", "X-v0", [entry(0)])
     path = tmp_path / "verification.json"
     path.write_text(text)

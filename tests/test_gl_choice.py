@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`use_gl`, in new processes, because it depends on their imports."""
+"""Test `use_gl` in new processes, because it depends on what was imported before."""
 
 import pytest
 from other_python import run_python, without_gl
@@ -12,12 +12,12 @@ _HEAD = "import logging, os, sys; import mjrec; logging.basicConfig(level='INFO'
 
 
 def run(code, **variables):
-    """Run `code` in a Python with only these variables for OpenGL."""
+    """Run `code` in a new Python with only these OpenGL variables."""
     return run_python(_HEAD + code, env=without_gl(**variables))
 
 
 def error_of(code, **variables):
-    """Return the error of `code`, which must change no variable."""
+    """Return the error that `code` raises, and check that no variable changes."""
     body = "\n  ".join(code.splitlines())
     wrapped = (
         f"before = dict(os.environ)\ntry:\n  {body}\n"
@@ -34,22 +34,22 @@ def error_of(code, **variables):
     [
         ("answer = mjrec.use_gl()", {}),
         ("answer = mjrec.use_gl(' EGL ')", {}),
-        # It sets the spelling that every program understands.
+        # The result has the spelling that every program understands.
         ("answer = mjrec.use_gl()", {"MUJOCO_GL": "EGL"}),
         ("answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "nonsense"}),
-        # "on" leaves the backend open.
+        # The value "on" does not choose a backend.
         ("answer = mjrec.use_gl()", {"MUJOCO_GL": "on"}),
         ("answer = mjrec.use_gl()", {"PYOPENGL_PLATFORM": "osmesa"}),
         ("import mujoco; answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "egl"}),
     ],
 )
 def test_backend_comes_from_argument_variable_or_first_that_renders(code, variables):
-    """It sets both variables."""
+    """`use_gl` sets both variables to the backend."""
     assert run(code + _SHOW, **variables).stdout == "egl egl egl\n"
 
 
 def test_mujoco_imported_later_uses_the_backend():
-    """Importing mjrec.gl imports neither mujoco nor OpenGL."""
+    """`mjrec.gl` itself imports neither mujoco nor OpenGL."""
     code = (
         "import mjrec.gl\n"
         "assert not {'mujoco', 'OpenGL', 'glfw', 'dm_control'} & set(sys.modules)\n"
@@ -71,7 +71,7 @@ def test_mujoco_imported_later_uses_the_backend():
             *("mjrec.use_gl('glfw')", {}),
             ["backend glfw (requested) cannot", "DISPLAY is not set", "xvfb-run"],
         ),
-        # An earlier import has chosen another backend.
+        # An earlier import of mujoco has already chosen another backend.
         (
             *("import mujoco\nmjrec.use_gl('egl')", {}),
             ["mujoco was imported with glfw", "switch to egl", "before anything"],
@@ -81,7 +81,7 @@ def test_mujoco_imported_later_uses_the_backend():
             {"PYOPENGL_PLATFORM": "glx"},
             ["PyOpenGL was imported with glx in this process"],
         ),
-        # A stand-in for dm_control with OSMesa, which not every machine has.
+        # This stand-in for dm_control uses OSMesa, which not every machine has.
         (
             "import types\nmodule = types.ModuleType('dm_control._render')\n"
             "module.BACKEND = 'osmesa'\nsys.modules['dm_control._render'] = module\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering on a given GPU, found among EGL's devices."""
+"""Test rendering on an assigned GPU, which is looked up among EGL's devices."""
 
 import re
 from dataclasses import replace
@@ -13,19 +13,19 @@ from mjrec.gl.choice import probe
 from mjrec.gl.devices import device_of_gpu, visible_gpus
 from mjrec.gl.egl import EglDevice
 
-# EGL's answers on a machine with one NVIDIA H100 (driver 580.159.04) while
-# CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
+# EGL described an NVIDIA H100 (driver 580.159.04) like this while
+# CUDA_VISIBLE_DEVICES was unset, "0" or the UUID of the GPU.
 H100 = EglDevice(index=0, device_file="", cuda_id=0, software=False, in_use=True)
 H100 = replace(H100, uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b")
-# The same, while it was empty, "1", "-1" or another UUID.
+# With the variable empty, "1", "-1" or another UUID, EGL reported this instead.
 HIDDEN = replace(H100, cuda_id=None)
-# The order of the vendor files puts it before or after the GPU.
+# The order of the vendor files decides whether llvmpipe precedes the GPU.
 LLVMPIPE = replace(HIDDEN, software=True, in_use=False, uuid="")
 OTHER = replace(HIDDEN, index=1, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211")
 
 
 def run(code, **variables):
-    """Run `code` in a Python with only these variables for OpenGL."""
+    """Run `code` in a new Python with only these OpenGL variables."""
     head = (
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
@@ -46,14 +46,14 @@ SHOWN = replace(H100, index=2, cuda_id=3)
 @pytest.mark.parametrize(
     ("devices", "gpu", "expected"),
     [
-        # CUDA's number identifies it anywhere in EGL's list; the number
-        # may count all GPUs or only visible ones.
+        # A GPU is found by its CUDA number anywhere in EGL's list; the number may
+        # count all GPUs or only the visible ones.
         ([H100], "0", H100),
         ([LLVMPIPE, OTHER, SHOWN], "0", SHOWN),
-        # EGL knows UUIDs even if CUDA shows nothing; a prefix is enough.
+        # EGL knows UUIDs even if CUDA hides every GPU; a prefix is enough.
         ([HIDDEN, OTHER], OTHER.uuid, OTHER),
         ([HIDDEN, OTHER], "GPU-F3544F26", HIDDEN),
-        # No device, or several, match.
+        # No device or more than one device matches.
         ([], "0", None),
         ([LLVMPIPE], "0", None),
         ([HIDDEN, OTHER], "GPU-", None),
@@ -66,13 +66,13 @@ def test_egl_device_is_found_by_cuda_number_or_uuid(devices, gpu, expected):
 
 
 def test_visible_gpus_are_those_of_cudas_variable_or_openable_files(tmp_path):
-    """CUDA reads the variable up to the first invalid entry."""
+    """CUDA ignores the first invalid entry of the variable and all later ones."""
     cases = {" 2 , GPU-1a2b ": ["2", "GPU-1a2b"], "": [], "-1": [], "0,-1,2": ["0"]}
     for text, expected in cases.items():
         assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
     for name in ("nvidia2", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
         (tmp_path / name).touch()
-    # A directory cannot be opened for writing, like a GPU that is not granted.
+    # A directory, like a GPU that was not assigned, cannot be opened for writing.
     (tmp_path / "nvidia6").mkdir()
     assert visible_gpus({}, devices=tmp_path) == ["0", "1"]
     assert visible_gpus({}, devices=tmp_path / "none") == []
@@ -89,13 +89,13 @@ def test_invalid_gpus_are_rejected(gpu):
     [
         ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was not assigned a GPU"),
         ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was not assigned a GPU"),
-        # `MUJOCO_GL` takes precedence, with a warning.
+        # `MUJOCO_GL` takes precedence, but a warning is logged.
         ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was assigned for rendering, but"),
         ("'77'", {}, r"GPU 77 was assigned for rendering, but (EGL has only|none of)"),
     ],
 )
 def test_unusable_gpu_is_a_warning_or_an_error_if_required(gpu, variables, message):
-    """No variable changes."""
+    """No environment variable is changed in either case."""
     done = run(
         f"before = dict(os.environ)\nassert render_on_given_gpu({gpu}) is None\n"
         f"assert dict(os.environ) == before\n"

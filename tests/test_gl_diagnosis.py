@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error messages of mujoco 3.3, 3.17 and 4.0 lead to causes and fixes."""
+"""Test the causes and fixes given for errors of mujoco 3.3, 3.17 and 4.0."""
 
 import pytest
 
@@ -64,7 +64,7 @@ def test_known_messages_have_a_cause_and_a_fix(text, environ, expected):
     assert expected in f"{found.cause}\n{found.fix}"
 
 
-def test_unknown_messages_have_none_and_the_backend_matters():
+def test_unknown_message_has_no_cause_and_causes_depend_on_backend():
     assert diagnose("FileNotFoundError: cheetah.xml", environ={}) is None
     for backend, word in (("glfw", "display"), ("egl", "current")):
         assert word in diagnose(_CONTEXT, backend=backend, environ={}).cause

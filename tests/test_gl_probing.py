@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Probes cause each known OpenGL failure in a child process and explain it."""
+"""Test that a probe in a child process explains each known OpenGL failure."""
 
 import json
 import os
@@ -20,7 +20,7 @@ _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
 def probe_with(backend, **variables):
-    """Probe with only these variables for OpenGL."""
+    """Probe with only these OpenGL variables."""
     return probe_environment(without_gl(MUJOCO_GL=backend, **variables))
 
 
@@ -33,7 +33,7 @@ def test_egl_renders_and_reports_driver_speed_and_devices(monkeypatch):
     assert answer.frames_per_second > 0
     assert [device.index for device in answer.devices] == [*range(len(answer.devices))]
     assert sum(device.in_use for device in answer.devices) == 1
-    # It remembers the answer until a variable changes.
+    # The answer is remembered until a variable changes.
     assert probe("egl") is probe("egl", measure=True) is answer
     monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
     assert not probe("egl").renders
@@ -77,20 +77,20 @@ DEAF = "import signal; signal.pthread_sigmask(0, range(1, 64)); signal.pause()"
     ("code", "timeout", "cause"),
     [
         ("import ctypes; ctypes.string_at(0)", 120, "The driver crashed (SIGSEGV)"),
-        # An unknown message is shown unchanged.
+        # The message of an unknown error is shown unchanged.
         ("raise SystemExit('the moon is in another quarter')", 120, "the moon is in"),
         (DEAF, 0.2, "The driver hangs"),
     ],
 )
 def test_end_of_the_child_is_explained(tmp_path, code, timeout, cause, monkeypatch):
-    """A child that ignores other signals is killed."""
+    """A child that hangs and ignores signals is killed."""
     (tmp_path / "sitecustomize.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=timeout)
     assert cause in answer.cause
 
 
-def test_software_rendering_beside_a_gpu_is_a_warning(tmp_path, monkeypatch):
+def test_software_rendering_despite_a_gpu_is_a_warning(tmp_path, monkeypatch):
     software = Probe("egl", renders=True, gl_renderer="llvmpipe (LLVM 15)")
     hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
     assert (software.software, hardware.software) == (True, False)
@@ -124,7 +124,7 @@ def test_wrong_frames_are_failures(spoil, message):
         gl_probe.check_frame(spoil(frame))
 
 
-# In a mount namespace, links to all but the hidden libraries replace the directory.
+# In a mount namespace, this directory is replaced by links to all other libraries.
 _LIBRARIES = Path("/usr/lib", sysconfig.get_config_var("MULTIARCH") or "nowhere")
 _VENDORS = "/usr/share/glvnd/egl_vendor.d"
 _HIDE = r"""
@@ -151,7 +151,7 @@ print(json.dumps(dataclasses.asdict(probe(sys.argv[1]))))
 
 @pytest.fixture(scope="module")
 def namespaces():
-    """Return `unshare`, if this user may have mount namespaces."""
+    """Return `unshare` if this user may create mount namespaces."""
     tried = subprocess.run(
         "unshare -Urm mount --bind /usr /usr", shell=True, capture_output=True
     )
@@ -168,13 +168,13 @@ def namespaces():
         ("egl", "libEGL.so*", "", "", ["EGL's library, libEGL.so.1, is not"]),
         ("egl", "libEGL_mesa.so*", "", "", ["libEGL_mesa.so.0, named in"]),
         ("egl", "", "", _VENDORS, ["without a driver"]),
-        # Mesa's drivers, since 24.2 one library that EGL's needs.
+        # Since Mesa 24.2, all drivers are in one library, which libEGL_mesa needs.
         (
             *("egl", "dri libgallium-*", "", ""),
             ["Mesa's driver swrast is not installed", "libEGL_mesa.so.0, named in"],
         ),
         ("osmesa", "libOSMesa.so*", "", "", ["OSMesa's library, libOSMesa.so.8, is"]),
-        # Mesa 25.1.3 has no OSMesa.
+        # Mesa 25.1.3 no longer has OSMesa.
         ("osmesa", "libOSMesa.so*", "libgallium-25.1.3-1.so", "", ["has no OSMesa"]),
     ],
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small modules that all others use: JSON, atomic files, frames, errors."""
+"""Test the modules that all others use: JSON, atomic files, frames and errors."""
 
 import json
 import math
@@ -28,9 +28,9 @@ LOOP.append(LOOP)
         ((np.arange(3), 0.1), "[[0, 1, 2], 0.1]"),
         ({1: 2, None: np.int64(3)}, '{"1": 2, "null": 3}'),
         ([math.nan, np.float32("nan")], "[null, null]"),
-        # JSON parsers read 1e999 as infinity; strings stay strings.
+        # JSON parsers read 1e999 as infinity; strings are not converted.
         ([math.inf, -math.inf, "Infinity"], '[1e999, -1e999, "Infinity"]'),
-        # Facts for people never stop a run.
+        # Facts that only people read must never stop a run.
         ({"a": Path("x")}, '{"a": {"repr": "PosixPath(\'x\')"}}'),
         (LOOP, '[{"repr": "[[...]]"}]'),
     ],
@@ -46,17 +46,17 @@ def test_nan_and_infinity_are_read_back():
 
 
 def test_file_appears_whole_or_not_at_all(tmp_path):
-    """A failure leaves the old file and no temporary one."""
+    """A failure leaves the old file unchanged and no temporary file."""
     path = tmp_path / "openaigym.video.0.7.video000015.mp4"
     with replacing(path) as temporary:
         temporary.write_text("half")
         assert not path.exists()
         hidden = rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.part"
         assert re.fullmatch(hidden, temporary.name)
-        # The infix lets cleanup find the leftovers of a killed process.
+        # The infix lets cleanup find files that a killed process left behind.
         assert infix_of(temporary.name) == "0.7"
     write_text(path, "old")
-    # The last character cannot be written.
+    # The last character cannot be encoded, so writing fails.
     with pytest.raises(UnicodeEncodeError), replacing(path) as temporary:
         temporary.write_text("new\udc80")
     assert path.read_text() == "old"

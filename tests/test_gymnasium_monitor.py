@@ -17,7 +17,7 @@ BAR = [4, 8, 12, 16]
 
 
 def shown(directory, episode):
-    """Return the length of the corridor's bar in each frame of a video."""
+    """Return the length of the corridor's bar in each frame of the video."""
     frames = frames_in(directory, episode)
     return [int((frame[0, :, 0] > 128).sum()) for frame in frames]
 
@@ -37,12 +37,12 @@ def test_records_scheduled_episodes(corridor, tmp_path, play, names, caplog):
         assert all((tmp_path / name).is_file() for name in pair)
     schedule = manifest["mjrec"]["schedule"]
     assert schedule == {"name": "capped_cubic_video_schedule", "recorded": [0, 1, 8]}
-    # No lock and no temporary file stays.
+    # No lock file or temporary file is left.
     assert [name for name in names(tmp_path) if name.startswith(".")] == []
 
 
 def test_video_has_n_plus_1_frames_and_metadata(make_corridor, tmp_path, play):
-    """A close within an episode keeps its frames."""
+    """If the monitor is closed within an episode, its frames are kept."""
     listed = []
 
     class Watching(make_corridor):
@@ -59,7 +59,7 @@ def test_video_has_n_plus_1_frames_and_metadata(make_corridor, tmp_path, play):
     env.close()
     env.close()
     assert listed == [True]
-    # Nothing counts after close; total steps include the unfinished episode.
+    # Steps after `close` do not count; those of the unfinished episode do.
     env.reset()
     env.step(0)
     assert (env.episode_id, env.get_total_steps()) == (2, 4)
@@ -87,7 +87,7 @@ def test_frame_collections_keep_each_frame_once(corridor, tmp_path, play, pop_fr
 
 
 def test_write_upon_reset_writes_results_at_each_reset(make_corridor, tmp_path, play):
-    """Without videos it needs no render mode."""
+    """A monitor without videos needs no render mode."""
     corridor = make_corridor(render_mode=None)
     with mjrec.Monitor(corridor, tmp_path, False, write_upon_reset=True) as env:
         play(env, 2)
@@ -97,7 +97,7 @@ def test_write_upon_reset_writes_results_at_each_reset(make_corridor, tmp_path, 
 
 
 def test_steps_and_resets_out_of_order_are_errors(corridor, tmp_path, play):
-    """The environment is not called, and the episode can go on."""
+    """The environment is not called, and the episode can continue."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         with pytest.raises(ResetNeeded, match="before the first reset"):
             env.step(0)
@@ -117,7 +117,7 @@ def test_steps_and_resets_out_of_order_are_errors(corridor, tmp_path, play):
 
 
 def test_schedule_is_called_once_per_episode(corridor, tmp_path, play):
-    """A second reset before any step replaces the frame."""
+    """A second reset before the first step replaces the first frame."""
     asked = []
 
     def even(episode_id):
@@ -141,13 +141,13 @@ def test_gymnasiums_checker_accepts_the_monitor(tmp_path):
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
     monitor = mjrec.Monitor(env, tmp_path, video_callable=False, allow_early_reset=True)
     with warnings.catch_warnings():
-        # It warns of wrappers, and of HalfCheetah's unbounded spaces.
+        # `check_env` warns about wrappers and HalfCheetah's unbounded spaces.
         warnings.simplefilter("ignore")
         check_env(monitor, skip_render_check=True)
 
 
 def test_automatic_resets_begin_episodes(make_corridor, tmp_path):
-    """A reset within the last step, as in gym, loses a frame."""
+    """If `step` itself resets, as in gym, the last frame of an episode is lost."""
 
     class Looping(make_corridor):
         metadata = make_corridor.metadata | {"semantics.autoreset": True}
@@ -171,7 +171,7 @@ def test_automatic_resets_begin_episodes(make_corridor, tmp_path):
 
 @pytest.mark.parametrize("thread", ["main", "mjrec-encoder"])
 def test_garbage_collection_closes_the_monitor(corridor, tmp_path, play, thread):
-    """It never closes on a thread that close waits for."""
+    """The monitor is never closed on a thread for which `close` waits."""
     holder = [mjrec.Monitor(corridor, tmp_path)]
     play(holder[0], 1)
     collector = threading.Thread(target=holder.clear, name=thread)
@@ -241,7 +241,7 @@ def test_episode_info_equals_record_episode_statistics(tmp_path):
     assert list(episode) == list(expected) == ["r", "l", "t"]
     assert (episode["r"], episode["l"]) == (expected["r"], expected["l"])
     assert 0 < episode["t"] < 60
-    # Gymnasium's own asserts that the key is absent: it is off by default.
+    # The option is off by default, because Gymnasium asserts that the key is absent.
     with monitor(tmp_path / "off") as env:
         assert infos_of(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
     with monitor(tmp_path / "around", theirs, episode_info=True) as env:
@@ -262,5 +262,5 @@ def test_episode_info_equals_record_episode_statistics(tmp_path):
     ],
 )
 def test_success_comes_from_the_info(info, expected):
-    """Values without a truth value are ignored."""
+    """Values that cannot be converted to bool are ignored."""
     assert success_in(info) is expected

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium environments whose frames can be drawn from states, and obstacles."""
+"""Test which Gymnasium environments can be rendered from states."""
 
 import functools
 import json
@@ -52,14 +52,14 @@ class Renderer(MujocoRenderer):
 
 
 def changed(env, part, **values):
-    """Set attributes of the environment or of a part; return the environment."""
+    """Set attributes of the environment or a part of it, and return the environment."""
     for name, value in values.items():
         setattr(operator.attrgetter(part)(env) if part else env, name, value)
     return env
 
 
 def test_most_wrappers_of_gymnasium_are_no_obstacle():
-    """With a requested view, no wrapper is one."""
+    """If a view is requested, no wrapper is an obstacle."""
     env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(make()))
     env = wrappers.NormalizeReward(wrappers.Autoreset(env))
     assert gymnasium_scenes(env).obstacle is None
@@ -69,14 +69,14 @@ def test_most_wrappers_of_gymnasium_are_no_obstacle():
 
 
 OBSTACLES = [
-    # The obstacle names the overriding class, anywhere in the chain.
+    # The message names the overriding class, wherever it is in the chain.
     (
         lambda: gymnasium.Wrapper(Below(make())),
         f"wrapper {__name__}.Overlay overrides",
     ),
     (lambda: wrappers.RenderCollection(make()), "rendering.RenderCollection overrides"),
     (lambda: changed(make(), "", render=print), "TimeLimit overrides"),
-    # It draws another environment.
+    # This method renders another environment.
     (lambda: changed(make(), "", render=make().render), "TimeLimit overrides"),
     (
         lambda: changed(make(), "unwrapped", render=make().unwrapped.render),
@@ -101,7 +101,7 @@ def test_overridden_rendering_is_a_named_obstacle(made, words):
 
 
 def test_patched_render_method_is_an_obstacle(monkeypatch):
-    """Even if it copies the name of Gymnasium's."""
+    """The patch is an obstacle even if it has the name of Gymnasium's method."""
     original = MujocoEnv.render
 
     @functools.wraps(original)
@@ -131,7 +131,7 @@ viewer_of = operator.attrgetter(VIEWER)
     ],
 )
 def test_additions_to_the_viewer_are_momentary_obstacles(change, words):
-    """`env.render()` shows them, and the scene does not."""
+    """`env.render()` shows such additions, but the scene does not have them."""
     env = make()
     scene = scene_of(env)
     assert scene.obstacle() is None
@@ -157,7 +157,7 @@ def test_replaced_renderer_replaces_camera_and_options():
 
 
 def test_requested_camera_is_a_name_a_number_or_an_object():
-    """The free camera follows the model's defaults."""
+    """The free camera uses the defaults of the model."""
     env = make("HalfCheetah-v5")
     view = scene_of(env, camera="track", height=32)()
     assert (view.camera.fixedcamid, view.label) == (0, "track")
@@ -177,7 +177,7 @@ def test_requested_camera_is_a_name_a_number_or_an_object():
 
 
 def test_environment_facts_suffice_to_make_it_again():
-    """JSON arguments, the smallest step limit, and wrappers with an effect."""
+    """The facts are JSON, with the smallest step limit and only relevant wrappers."""
     env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
     environment = gymnasium_scenes(env).environment
     assert environment["kwargs"]["healthy_z_range"] == [0.5, 2.5]

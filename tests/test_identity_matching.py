@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of people and machines in texts and bytes."""
+"""Test finding names of people and machines in text and bytes."""
 
 import os
 
@@ -39,7 +39,7 @@ IDENTITY = Identity(
         ("on brunelli-ws7.uni", "on <host>.uni"),
         ("An Li, italian, Li_An", "<user>, italian, <user>"),
         ("Bob Green, green", "<user>, green"),
-        # HalfCheetah's joint `rootx` does not name root.
+        # `rootx` is a joint of HalfCheetah and does not name the user root.
         *((text, text) for text in ("rootx", "root", "vm", "adapt", "ada", "balance")),
         *((text, text) for text in ("vmax", "Madagascar")),
     ],
@@ -52,14 +52,14 @@ def test_identities_become_placeholders(text, expected):
 
 
 def test_file_names_stay_portable():
-    """Placeholders in file names have no brackets."""
+    """Placeholders in file names are written without brackets."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.replaced_in_name("0.ada-run.vm_2") == "0.user-run.host_2"
     assert matcher.replaced_in_name("0.rooty.mbrunelli") == "0.rooty.user"
 
 
-def test_short_words_in_binary_data_are_chance():
-    """A long name, or a line of text, counts."""
+def test_short_words_in_binary_data_are_ignored():
+    """Only a long name or a name within a line of text is a match."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.found_in_bytes(b"\x00\xffAlan:/vm:\xfe\x01") == []
     assert matcher.found_in_bytes(b"Alan", by_chance=True) == []
@@ -69,7 +69,7 @@ def test_short_words_in_binary_data_are_chance():
 
 
 def test_non_ascii_names_are_found_in_bytes():
-    """JSON escapes count too."""
+    """Names are also found if they are written with JSON escapes."""
     matcher = IdentityMatcher(Identity(users={"joséphine"}, people={"Łukasz Wąs"}))
     assert matcher.found_in_bytes(b'{"by": "Jos\\u00e9phine"}') == ["Joséphine"]
     for encoding in ("utf-8", "utf-16-le"):
@@ -106,7 +106,7 @@ def test_identity_comes_from_system_and_authors(tmp_path, monkeypatch):
     assert os.uname().nodename in identity.hosts
     assert "Margherita Brunelli" in identity.people
     assert {"mb@uni.example", "0000-0002-1825-0097"} <= identity.addresses
-    # An affiliation may be a word of every license.
+    # An affiliation such as MIT can be a word in every license.
     assert IdentityMatcher(identity).replaced("under MIT") == "under MIT"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A lock is held until it is released or its process dies."""
+"""Test that a lock is held until it is released or its process dies."""
 
 import os
 import subprocess
@@ -16,12 +16,12 @@ from mjrec.formats.locks import Lock, try_lock, wait_for_lock
 path = pathlib.Path(sys.argv[1])
 """
 WAIT = 'print("held", flush=True)\nsys.stdin.read()\n'
-# A program and a forked child that outlive the holder of the lock.
+# These children, a program and a fork, outlive the holder of the lock.
 SURVIVORS = {
     "exec": 'subprocess.Popen(["cat"], stdout=subprocess.DEVNULL, close_fds=False)\n',
     "fork": "if os.fork(): sys.stdin.read()\nlock.release()\n",
 }
-# Each release removes the lock's file.
+# Every release deletes the lock file, so each iteration creates it again.
 COUNT = """
 number = path.with_name("number")
 for _ in range(300):
@@ -38,7 +38,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def start(path):
-    """Return a function that runs code in a process with the lock's `path`."""
+    """Return a function that runs code in a process where `path` is the lock file."""
     started = []
 
     def run(code):
@@ -71,7 +71,7 @@ def test_release_removes_only_its_own_file(path):
 @pytest.mark.parametrize("way", ["Lock", "try_lock"])
 @pytest.mark.parametrize("survivor", SURVIVORS)
 def test_killed_process_holds_no_lock(path, survivor, way, start):
-    """Another process takes over the file, although a child survives."""
+    """Another process can take over the lock file even while a child survives."""
     call = 'Lock(path, "content")' if way == "Lock" else "try_lock(path)"
     holder = start(f"lock = {call}\n{SURVIVORS[survivor]}{WAIT}")
     assert holder.stdout.readline() == "held\n"
@@ -97,7 +97,7 @@ def test_lock_is_exclusive_between_processes(path, start):
 
 @pytest.mark.parametrize("get", [try_lock, wait_for_lock])
 @pytest.mark.parametrize("put", [os.symlink, os.link, lambda _, path: os.mkfifo(path)])
-def test_links_and_pipes_are_no_locks(put, get, path):
+def test_links_and_pipes_are_rejected_as_locks(put, get, path):
     victim = path.with_name("victim")
     victim.write_text("valuable")
     put(victim, path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes to a model or view are noticed, and only changes."""
+"""Test that changes to a model or view are noticed, without false alarms."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def view():
 
 
 def change(struct, name):
-    """Change a field, or the last byte of an array."""
+    """Change a field or, if it is an array, its last byte."""
     holder, last = holder_of(struct, name)
     value = getattr(holder, last)
     if isinstance(value, np.ndarray):
@@ -41,7 +41,7 @@ def change(struct, name):
 
 
 def test_change_of_any_field_is_noticed_by_name(model):
-    """Fields are arrays and members of `opt`, `vis` and `stat`."""
+    """The fields are all arrays and all members of `opt`, `vis` and `stat`."""
     looks = Looks(model)
     looks.follow(view())
     arrays = [name for name in array_names() if getattr(model, name).size]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resources of a process, read from small trees of kernel files."""
+"""Test resources of a process, read from small trees of kernel files."""
 
 import os
 
@@ -12,13 +12,13 @@ from mjrec.machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
     ("own", "quotas", "expected"),
     [
         ("0::/\n", {"": "250000 100000"}, 2.5),
-        # The lowest quota of all parents counts.
+        # The lowest quota among all parents applies.
         (
             "0::/a/b/c\n",
             {"a": "100000 100000", "a/b": "400000 100000", "a/b/c": "max 100000"},
             1.0,
         ),
-        # No limit.
+        # These trees set no limit.
         ("0::/\n", {"": "max 100000"}, None),
         ("0::/\n", {}, None),
         ("1:cpu:/\n", {"": "100000 100000"}, None),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many monitors record into one directory at once."""
+"""Test many monitors that record into one directory at the same time."""
 
 import copy
 import pickle

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MJCF files as environments."""
+"""Test MJCF files as environments."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from mjrec.environments.mjcf_environments import MjcfEnvironment, make_mjcf
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.simulation.mjcf import load_mjcf
 
-# A red ball on a rail with a motor, and a green one far away.
+# A motor moves a red ball on a rail; a green ball is far away.
 MODEL = """
 <mujoco>
   <option timestep="{timestep}"/>
@@ -50,7 +50,7 @@ def write(tmp_path):
     ("timestep", "fps"), [(0.0033, 60), (0.0166667, 60), (0.025, 40)]
 )
 def test_sixty_frames_a_second(write, timestep, fps):
-    """Frame times drift at most half a timestep; slower simulations keep their rate."""
+    """Frame times are at most half a timestep off; slow simulations keep their rate."""
     env = MjcfEnvironment(write(timestep=timestep))
     assert env.metadata["render_fps"] == fps
     assert env.control_timestep() == pytest.approx(1 / fps)
@@ -59,11 +59,11 @@ def test_sixty_frames_a_second(write, timestep, fps):
         for frame in range(1, 301):
             env.step(np.zeros(2))
             drift = abs(env.simulation.data.time - frame / fps)
-            # 1e-5 is the rounding of these timesteps.
+            # The tolerance of 1e-5 accounts for the rounding of these timesteps.
             assert drift <= timestep / 2 + 1e-5 * frame / fps
 
 
-# States have no bounds, and the author chose the actuators' ranges.
+# States are unbounded, and the model's author chose the actuator ranges.
 @pytest.mark.filterwarnings("ignore:.*Box (action|observation) space:UserWarning")
 def test_environment_passes_check_env(write):
     """Actions are controls; observations are positions and velocities."""
@@ -91,8 +91,8 @@ def test_model_without_actuators_takes_empty_actions(tmp_path):
 
 
 def test_unstable_simulation_terminates_at_its_last_state(write, tmp_path, monkeypatch):
-    """MuJoCo resets by itself; the episode must not continue."""
-    monkeypatch.chdir(tmp_path)  # for MUJOCO_LOG.TXT
+    """MuJoCo resets an unstable simulation by itself, so the episode must end."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT here.
     env = MjcfEnvironment(write(gear=1e12))
     env.reset()
     last, *_ = env.step(np.zeros(2))
@@ -140,7 +140,7 @@ def test_default_camera_follows_or_is_the_first(write):
     for _ in range(60):
         env.step(np.array([3, 0]))
     assert env.simulation.data.qpos[0] > 1
-    frame = env.render()  # with the ball in the middle
+    frame = env.render()  # The ball is in the middle.
     assert frame.shape == (32, 48, 3)
     assert frame[16, 24, 0] > 100 > frame[16, 24, 1]
     env.close()

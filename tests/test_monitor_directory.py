@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of monitor files."""
+"""Test the names of monitor files."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ CAMERAS = (
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_camera_gives_a_short_unique_file_name(name):
-    """It stays in its directory, whatever the camera's name."""
+    """The file is in the monitor's directory whatever the camera's name contains."""
     part = camera_part(name)
     file = with_part(FIRST, part)
     assert (infix_of(file), episode_of(file)) == ("0.7", 27)
@@ -33,7 +33,7 @@ def test_camera_gives_a_short_unique_file_name(name):
 
 
 def test_further_cameras_never_share_a_name():
-    """A number becomes its digits; an unnamed camera gets its position."""
+    """A number is used as it is, and an unnamed camera is named by its position."""
     assert camera_part("a b/ü.~") == "a%20b%2F%C3%BC%2E%7E"
     cameras = ["a", "side", {"distance": 1}, 1, "1", "side", "1-2", "camera3", "a"]
     assert monitor_directory.further_parts(cameras) == [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid options of `mjrec.Monitor` are refused before any file is made."""
+"""Test that `mjrec.Monitor` rejects invalid options before it creates any file."""
 
 import gc
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in notebooks."""
+"""Test how recordings are displayed in notebooks."""
 
 import base64
 import re
@@ -15,10 +15,10 @@ def videos_in(text):
     return [base64.b64decode(each) for each in found]
 
 
-# Takes more than five seconds: an episode is evaluated, and drawn twice.
+# Takes more than five seconds: it evaluates an episode and renders it twice.
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Evaluate an episode; return its video, and displayable objects by kind."""
+    """Evaluate an episode; return its video and a displayable object of each kind."""
     small = {"episodes": 1, "num_seeds": 1, "max_steps": 2, "height": 32, "width": 32}
     directory = tmp_path_factory.mktemp("evaluation") / "results"
     options = {"policy": "zero", "directory": directory, "workers": 1, "keep": "all"}
@@ -45,7 +45,7 @@ def recorded(tmp_path_factory):
     ],
 )
 def test_recording_shows_numbers_and_a_player(kind, texts, recorded):
-    """The output embeds the video, with its name below it."""
+    """The output embeds the video and shows its file name."""
     path, displayed = recorded
     text = displayed[kind]._repr_html_()
     if kind == "rendered":
@@ -64,7 +64,7 @@ def test_text_of_files_is_escaped(tmp_path):
 
 
 def test_large_and_missing_videos_are_named(tmp_path, monkeypatch):
-    """Videos beyond the limit, missing ones and links are names only."""
+    """Videos over the limit, missing videos and links are shown only by name."""
     monkeypatch.setattr(notebook, "MOST_BYTES", 10)
     for name, size in (("a", 6), ("b", 5), ("c", 4)):
         (tmp_path / f"{name}.mp4").write_bytes(name.encode() * size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories that a monitor may record into, and its first episode number."""
+"""Test where a monitor may record, and its first episode number."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def monitor(directory, **options):
 
 
 def first_number(directory, **options):
-    """Return a new monitor's first number, and remove the monitor."""
+    """Return the first episode number of a new monitor, and delete its files."""
     opened = monitor(directory, **{"resume": True, **options})
     opened.close()
     for path in directory.glob(f"*{opened.infix}*"):
@@ -38,7 +38,7 @@ def write_video(directory, infix, episode):
 
 
 def test_force_deletes_monitor_files_only(tmp_path, names):
-    """Other files stay, whatever their names begin with."""
+    """Other files stay, even if their names start like those of monitor files."""
     others = ["notes.txt", "openaigym.manifest.1.1.manifest.json", "openaigym.txt"]
     (tmp_path / others[1]).mkdir()
     for name in (others[0], others[2]):
@@ -51,16 +51,16 @@ def test_force_deletes_monitor_files_only(tmp_path, names):
 
 
 def test_resume_continues_after_the_highest_number(tmp_path):
-    """A uid limits this to its own runs; "join" reads no files."""
+    """With a uid, only runs with this uid count; "join" reads no files at all."""
     write_video(tmp_path, "0.1", 0)
-    # Videos alone count as recordings.
+    # Videos without other files count as recordings.
     with pytest.raises(ExistingRecordings, match=r"(?s)mp4.*resume=True.*force"):
         monitor(tmp_path)
     record(tmp_path, resume=True)
     assert first_number(tmp_path) == 3
     write_video(tmp_path, "0.alice", 7)
     write_video(tmp_path, "0.bob", 3)
-    # Numbers too long for a file name do not count.
+    # Numbers that are too long for a file name are ignored.
     write_video(tmp_path, "0.x", 10**150)
     for uid, expected in (("bob", 4), ("alice", 8), ("carol", 0), (None, 8)):
         assert first_number(tmp_path, uid=uid) == expected
@@ -78,7 +78,7 @@ def test_resume_never_reuses_a_monitor_id(tmp_path):
 
 
 def test_torn_line_keeps_its_number(tmp_path, caplog):
-    """Its episode is lost, and the log says so."""
+    """The episode of a torn line is lost, and a warning is logged."""
     journal = write_journal(tmp_path, "0.7", 0, 1, run={"env_info": ENV_INFO})
     journal.write_bytes(journal.read_bytes()[:-20])
     assert first_number(tmp_path) == 2
@@ -93,7 +93,7 @@ def test_invalid_next_number_is_an_error(tmp_path, number):
 
 
 def test_resume_over_another_environment_is_an_error(tmp_path):
-    """The error names both, also for an open or killed monitor."""
+    """The error names both environments, even if a monitor is open or was killed."""
     again = {"resume": True, "env_id": ANOTHER}
     with monitor(tmp_path / "a") as env:
         with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
@@ -117,7 +117,7 @@ def test_resume_over_another_environment_is_an_error(tmp_path):
     ],
 )
 def test_unwritable_directory_is_an_error(path, reason, tmp_path):
-    """A full disk leaves no directory."""
+    """If the disk is full, no directory is left."""
     (tmp_path / "file").touch()
     with pytest.raises(DirectoryNotWritable, match=reason):
         monitor(Path(path.format(tmp_path)))
@@ -127,7 +127,7 @@ def test_unwritable_directory_is_an_error(path, reason, tmp_path):
 
 
 def test_join_leaves_killed_monitors_alone(tmp_path, caplog):
-    """`resume=True` recovers them."""
+    """Only `resume=True` recovers the recordings of killed monitors."""
     env_id = ENV_INFO["env_id"]
     dead = write_log(tmp_path, infix="0.1", ended=False, env_id=env_id)
     left = [path for path in tmp_path.iterdir() if ".states." in path.name]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel's content and metadata, and its use alone."""
+"""Test the wheel's content and metadata, and its use without a checkout."""
 
 import email
 import os
@@ -18,7 +18,7 @@ SOURCE = ROOT / "src"
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Build the wheel without a network; return its files."""
+    """Build the wheel without a network, and return its files."""
     pytest.importorskip("build", reason="the tools for packages are missing")
     folder = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
@@ -53,7 +53,7 @@ def test_metadata_has_license_version_and_typing(wheel):
 
 @pytest.mark.wheel
 def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path):
-    """The environment holds the wheel and its dependencies alone."""
+    """The environment contains only the wheel and its dependencies."""
     python = os.environ.get("MJREC_TEST_WHEEL")
     if python is None:
         pytest.fail("scripts/test --all names an environment with the wheel.")

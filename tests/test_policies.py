@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading policies by name, and checking their actions."""
+"""Test loading policies by name and checking their actions."""
 
 import sys
 from pathlib import Path
@@ -31,7 +31,7 @@ def environment_with(space):
 
 @pytest.fixture
 def write(tmp_path, monkeypatch):
-    """Write modules into the working directory, and unload them afterwards."""
+    """Return a function that writes modules, and unload the modules afterwards."""
     monkeypatch.chdir(tmp_path)
     written = []
 
@@ -58,7 +58,7 @@ BOUNDS = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
     "space", [spaces.Box(-np.inf, np.inf, (2,), np.float64), MIXED, spaces.Box(*BOUNDS)]
 )
 def test_random_actions_depend_on_the_episode_seed_alone(space):
-    """They equal `space.sample()` and leave the space's own generator alone."""
+    """Actions equal those of `space.sample()`, but do not advance its generator."""
 
     def draw(policy, episode):
         policy.reset(episode_seeds(0, episode))
@@ -87,7 +87,7 @@ def test_random_actions_depend_on_the_episode_seed_alone(space):
     ],
 )
 def test_zero_is_the_action_nearest_to_zero(space, zero):
-    """A caller may write into an earlier action."""
+    """Writing to an earlier action must not change later ones."""
     policy = load_policy("zero", environment_with(spaces.Tuple([space])))
     for _ in range(2):
         policy.reset(SEEDS)
@@ -99,7 +99,7 @@ def test_zero_is_the_action_nearest_to_zero(space, zero):
 
 
 def test_dm_env_actions_are_drawn_within_their_bounds():
-    """Unbounded numbers are drawn around zero."""
+    """Actions without bounds are drawn from a normal distribution around zero."""
     specs = pytest.importorskip("dm_env").specs
     spec = {
         "bounded": specs.BoundedArray((2,), np.float32, [-1, 2.1], [0, 3]),
@@ -139,7 +139,7 @@ def test_dm_env_actions_are_drawn_within_their_bounds():
     ],
 )
 def test_actions_of_other_types_are_converted(space, action, taken):
-    """Policies return float64, lists, and arrays of one number."""
+    """Policies may return float64, lists, and arrays with a single number."""
     found = checked(space, action)
     assert taken == (found.tolist() if isinstance(found, np.ndarray) else found)
     assert type(taken) is not int or type(found) is int
@@ -161,7 +161,7 @@ def test_actions_of_other_types_are_converted(space, action, taken):
     ],
 )
 def test_invalid_action_is_refused(space, action):
-    """The error names the space and the action."""
+    """The error message contains the space and the action."""
     policy = policy_from(lambda _: action, "mine", environment_with(space))
     with pytest.raises(mjrec.PolicyError, match="must return an action in ") as caught:
         policy(None)
@@ -170,7 +170,7 @@ def test_invalid_action_is_refused(space, action):
 
 
 def test_functions_classes_and_calls_are_policies(write):
-    """A class gets the environment, arguments and seeds."""
+    """A class receives the environment, the arguments and the seeds."""
     write(
         "import mjrec_test_neighbour\n"
         "def double(observation): return observation * 2\n"
@@ -191,7 +191,7 @@ def test_functions_classes_and_calls_are_policies(write):
     policy = load("Policy", last=7)
     policy.reset(SEEDS)
     assert policy(None) == [3, 7]
-    assert sys.path == path  # the working directory was importable during loading
+    assert sys.path == path  # The working directory was added only for loading.
     with pytest.raises(mjrec.PolicyError, match="unexpected keyword argument 'scale'"):
         load("Policy", scale=3)
     for name in ("random", "mjrec_test_policy:double"):
@@ -200,10 +200,10 @@ def test_functions_classes_and_calls_are_policies(write):
 
 
 def test_predict_is_called_as_stable_baselines3_does():
-    """The call is deterministic and passes state and episode start."""
+    """The call is deterministic and passes the state and the episode start."""
 
     class Model:
-        calls = []  # noqa: RUF012  one object
+        calls = []  # noqa: RUF012  one list for all instances
 
         def predict(self, observation, state=None, episode_start=None, deterministic=0):
             self.calls.append((observation, state, *episode_start, deterministic))
@@ -222,12 +222,12 @@ def test_predict_is_called_as_stable_baselines3_does():
         policy("a")
         policy("b")
     assert Model.calls == [("a", None, True, True), ("b", 1, False, True)] * 2
-    # A `predict` with fewer arguments that returns only the action.
+    # `predict` may have fewer arguments and may return only the action.
     assert policy_from(Short(), "short", BOX)(1) == [1, 0]
 
 
 INVALID = [
-    # Similar built-in names, modules, names in the module, and files.
+    # Errors suggest similar built-in names, modules, names in modules, and files.
     ("", "rnd", mjrec.UnknownName, "'rnd'.*random, zero.*module:name"),
     ("", ":act", mjrec.UnknownName, "module:name"),
     ("", "mjrec_test_plicy:act", mjrec.UnknownName, "'mjrec_test_plicy'.*test_policy"),
@@ -236,7 +236,7 @@ INVALID = [
         *("import math\ndef act(o): pass\nclass Other: pass\n_x = 1\n", "atc"),
         *(mjrec.UnknownName, "'atc'.*Available: Other, act"),
     ),
-    # The line of the error.
+    # The message includes the line of the error.
     (
         *("def f(o): pass\n1 / 0\n", "f", mjrec.PolicyError),
         r"ZeroDivisionError.*mjrec_test_policy.py, line 2",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies in files: model.zip, TorchScript, torch.export and ONNX."""
+"""Test policies from files: model.zip, TorchScript, torch.export and ONNX."""
 
 import json
 import sys
@@ -16,7 +16,7 @@ from mjrec.environments.policies import load_policy, policy_file
 
 SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
 
-# Torch deprecates its older formats.
+# Torch warns that its older formats are deprecated.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*torch:DeprecationWarning"),
     pytest.mark.filterwarnings("ignore:.*torch.jit:FutureWarning"),
@@ -86,7 +86,7 @@ WEIGHTS = np.array([[2.0, 4.0]] * 3, np.float32)
 
 
 def export_network(directory, kind):
-    """Write a network that returns 2 and 4 times the sum of its observation."""
+    """Write a network that returns twice and four times the sum of an observation."""
     path = directory / f"network.{kind}"
     if kind == "onnx":
         pytest.importorskip("onnxruntime")
@@ -116,7 +116,7 @@ def export_network(directory, kind):
 @pytest.mark.stable_baselines3
 @pytest.mark.parametrize("kind", ["pt", "pt2", "onnx"])
 def test_network_gets_float32_rows(kind, tmp_path):
-    """Actions are clipped to their bounds."""
+    """Actions that the network returns are clipped to their bounds."""
     env = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
     policy = load_policy(str(export_network(tmp_path, kind)), env)
     policy.reset(SEEDS)

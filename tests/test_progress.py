@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress of rendering without a terminal."""
+"""Test the output of rendering progress without a terminal."""
 
 import io
 from types import SimpleNamespace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The provenance of a recording in its manifest."""
+"""Test the provenance of a recording in its manifest."""
 
 import hashlib
 import importlib.metadata
@@ -30,7 +30,7 @@ def git(directory, *arguments):
 
 
 def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
-    """The manifest has its command, packages, variables, commit and policy."""
+    """The manifest has the command, packages, variables, commit and policy."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")
     git(tmp_path, "remote", "add", "origin", "https://example.org/robot.git")
@@ -57,7 +57,7 @@ def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
         "sha256": hashlib.sha256(b"weights").hexdigest(),
     }
     (tmp_path / "train.py").write_text("pass\n")
-    # A busy machine takes longer than the monitor's timeout.
+    # A busy machine may need more time than the monitor's timeout.
     monkeypatch.setattr(provenance, "_SECONDS_AT_THE_END", 60)
     assert Provenance(tmp_path).found(wait=True)["code"]["dirty"] is True
     elsewhere = tmp_path_factory.mktemp("none")
@@ -65,7 +65,7 @@ def test_provenance_of_a_program(tmp_path, tmp_path_factory, monkeypatch):
 
 
 def test_short_process_exits_silently():
-    """The child that lists packages ends with it."""
+    """The child process that lists packages ends silently with its parent."""
     program = (
         "import logging; logging.basicConfig()\n"
         "from mjrec import child_python, provenance\n"
@@ -77,7 +77,7 @@ def test_short_process_exits_silently():
 
 @pytest.mark.parametrize("way", ["child", "no child", "child that fails"])
 def test_packages_equal_those_of_importlib(way, tmp_path, monkeypatch):
-    """Without a working child this process lists them."""
+    """If the child process fails, the parent lists the packages itself."""
     program = tmp_path / "python"
     if way == "child that fails":
         program.write_text("#!/bin/sh\necho '{}'\nexit 3\n")
@@ -107,13 +107,13 @@ INSTALLER_LINES = [
 
 
 def test_package_hashes_cover_the_wheel_alone(tmp_path, monkeypatch):
-    """The first version on the path counts; an installer's lines do not."""
+    """Only the first version on the path counts, without lines that installers add."""
     for version in ("1.5", "3.0"):
         info = tmp_path / version / f"gripper-{version}.dist-info"
         info.mkdir(parents=True)
         (info / "METADATA").write_text(f"Name: Gripper\nVersion: {version}\n")
     places = [tmp_path / "1.5", None, str(tmp_path / "1.5"), str(tmp_path / "3.0")]
-    # Entries of another type are skipped, as imports do.
+    # Entries that are not strings are skipped, as in imports.
     monkeypatch.setattr(sys, "path", [*places, *sys.path])
     found = installed_packages()["Gripper"]
     assert found == {"version": "1.5", "record_sha256": None}

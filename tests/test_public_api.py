@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of the package, its public names, and what importing it loads."""
+"""Test the package's layers, its public names, and what importing it loads."""
 
 import ast
 import importlib.metadata
@@ -13,7 +13,7 @@ from mjrec import errors
 
 PACKAGE = Path(mjrec.__file__).parent
 
-# From the bottom up. A module may import from its own row and from those below.
+# Rows are listed bottom-up; a module may import from its own row and those below.
 ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
@@ -37,7 +37,7 @@ ROWS = (
     {"commands"},
 )
 
-# The rows or files that may import a framework.
+# Each framework may be imported only by these rows or files.
 CONFINED = {
     "mujoco": {"simulation", "viewing"},
     "OpenGL": {"simulation"},
@@ -62,7 +62,7 @@ HEAVY = (
     *("h5py", "imageio", "ray", "submitit", "viser", "mjviser", "trimesh"),
 )
 
-# Paths by dotted name below the package.
+# The keys are dotted names relative to the package.
 MODULES = {
     ".".join(part for part in parts if part != "__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
@@ -72,7 +72,7 @@ MODULES = {
 
 
 def imports(name, path):
-    """Yield the imports of a module, also inside functions, as absolute names."""
+    """Yield the absolute names of a module's imports, even of those in functions."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -89,7 +89,7 @@ def imports(name, path):
 
 
 def _imported_by_call(call, package):
-    """Yield the import of a call like `import_module("..a.b", __package__)`."""
+    """Yield the module that `import_module("..a.b", __package__)` would import."""
     function = ast.unparse(call.func).rpartition(".")[2]
     first = call.args[0] if call.args else None
     if function == "import_module" and isinstance(first, ast.Constant):
@@ -144,7 +144,7 @@ def test_every_error_is_public_and_in_the_error_tree():
 
 
 def test_import_is_inert():
-    """It loads no simulator, OpenGL or ffmpeg; a monitor loads no HDF5."""
+    """Importing mjrec loads no simulator, OpenGL or ffmpeg; a monitor loads no HDF5."""
     assert run_python(
         "import os, sys; before = dict(os.environ); import mjrec; "
         f"print([m for m in {HEAVY} if m in sys.modules], before == os.environ); "
@@ -162,7 +162,7 @@ def test_reading_results_needs_no_simulator():
 
 
 def test_no_module_hides_a_public_name():
-    """A submodule's name would replace the public name when it is imported."""
+    """A submodule with the name of a public object would replace it when imported."""
     assert run_python(
         "import contextlib, importlib, importlib.util, pkgutil, types, mjrec\n"
         "lacks = not importlib.util.find_spec('dm_control')\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact frame rates."""
+"""Test exact frame rates."""
 
 from fractions import Fraction
 
@@ -23,7 +23,7 @@ from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, stride_for, to_rate
     ],
 )
 def test_rate_is_an_exact_fraction(found, rate):
-    """Numbers of every kind, and sums of them, become the fraction that they mean."""
+    """Numbers of every type, and their sums, become the fraction they stand for."""
     assert found == rate
 
 
@@ -41,7 +41,7 @@ def test_invalid_timestep_is_an_error(timestep):
 
 @pytest.mark.parametrize("timestep", [1.234567, 1e-6, 12.3456789])
 def test_rate_of_any_timestep_fits_a_video_file(timestep):
-    """Both terms are at most a million; the error is at most a millionth."""
+    """The fraction's terms are at most a million, and its error at most a millionth."""
     rate = rate_from_timestep(timestep)
     assert max(rate.numerator, rate.denominator) <= MAX_DENOMINATOR
     assert float(rate) * timestep == pytest.approx(1, rel=1e-6)

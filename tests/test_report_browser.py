@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report pages in headless Chromium, driven by Playwright."""
+"""Test report pages in headless Chromium with Playwright."""
 
 import contextlib
 import re
@@ -37,7 +37,7 @@ def page(browser):
 
 @contextlib.contextmanager
 def page_of_width(browser, width, **options):
-    """Open a page that must log no errors and request only files."""
+    """Open a page, and check that it logs no errors and requests only files."""
     size = {"width": width, "height": 900}
     with browser.new_context(viewport=size, **options) as context:
         page = context.new_page()
@@ -60,7 +60,7 @@ def videos(tmp_path_factory):
 
 
 def benchmark_report():
-    """Return two tasks of fifty episodes with their best and worst videos."""
+    """Return a report of two tasks with fifty episodes, with best and worst videos."""
     report = contents(problems=["b"])
     for each in report.tasks:
         order = np.argsort(each.episodes["total_reward"]).tolist()
@@ -87,7 +87,7 @@ def benchmark(page, videos):
 
 
 def test_videos_play(benchmark):
-    """Only one plays at a time."""
+    """Only one video plays at a time."""
     players = benchmark.locator("video")
     expect(players).to_have_count(0)
     buttons = benchmark.get_by_role("button", name="Play dm_control/")
@@ -109,7 +109,7 @@ def test_videos_play(benchmark):
 
 @parametrize("single_file", [False, True])
 def test_report_of_a_recording_plays(page, tmp_path, make_corridor, play, single_file):
-    """The recording itself is deleted first."""
+    """The report works after the recording has been deleted."""
     directory = tmp_path / "recordings #1"
     with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
         play(monitor, 3, seed=0)
@@ -121,14 +121,14 @@ def test_report_of_a_recording_plays(page, tmp_path, make_corridor, play, single
     page.get_by_role("button", name="Play").first.click()
     player = page.locator("video").first
     page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
-    # The reset's frame and 20 steps, at the environment's 10 frames a second.
+    # There are 21 frames, for the reset and 20 steps, at 10 frames per second.
     assert player.evaluate("v => v.duration") == pytest.approx(2.1, abs=0.1)
     assert player.evaluate("v => v.poster") != ""
 
 
 @pytest.mark.thorough
 def test_tables_sort_by_mouse_and_keyboard(page, tmp_path):
-    """Unknown values come last in either direction."""
+    """Unknown values come last in both directions."""
     unknown = task("c", [2.0], failures={0: "x"})
     known = task("a", [3.0, 3.0]), task("b", [1.0])
     open_report(page, tmp_path, contents(*known, unknown))
@@ -146,7 +146,7 @@ def test_tables_sort_by_mouse_and_keyboard(page, tmp_path):
 
 @pytest.mark.thorough
 def test_gallery_filters_by_mouse_and_keyboard(benchmark):
-    """A link in the episode table shows a hidden video again."""
+    """A link in the episode table makes a hidden video visible again."""
 
     def shown():
         cards = benchmark.locator(".card:not([hidden])").all()
@@ -168,7 +168,7 @@ def test_gallery_filters_by_mouse_and_keyboard(benchmark):
 
 @pytest.mark.thorough
 def test_command_is_copied_or_selected(benchmark):
-    """A browser may refuse the clipboard to local files."""
+    """If the browser denies access to the clipboard, the text is selected instead."""
     card = benchmark.locator("#video-0")
     card.get_by_text("File, hash and command").click()
     command = card.get_by_role("button", name="Copy the command")
@@ -213,7 +213,7 @@ def test_large_tables_show_a_hundred_rows_a_page(page, tmp_path):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("report", [benchmark_report, hostile_report])
 def test_page_is_accessible(browser, videos, width, scheme, report):
-    """axe-core finds no serious barrier; phones need no horizontal scrolling."""
+    """axe-core finds no serious problem, and phones need no horizontal scrolling."""
     with page_of_width(browser, width, color_scheme=scheme) as page:
         open_report(page, videos, report())
         page.evaluate(
@@ -225,7 +225,7 @@ def test_page_is_accessible(browser, videos, width, scheme, report):
 
 @pytest.mark.thorough
 def test_printed_page_has_all_frames_and_no_buttons(browser, videos):
-    """The width is that of A4 with margins of one centimeter."""
+    """The page is as wide as A4 paper with margins of one centimeter."""
     with page_of_width(browser, 718) as page:
         page.emulate_media(media="print")
         open_report(page, videos, benchmark_report())
@@ -239,7 +239,7 @@ def test_printed_page_has_all_frames_and_no_buttons(browser, videos):
 
 
 def test_hostile_text_stays_text(page, browser, videos):
-    """The page's policy would block injected scripts as well."""
+    """Even if a script were injected, the page's security policy would block it."""
     open_report(page, videos, hostile_report())
     assert page.title() == HOSTILE[0]
     expect(page.locator("h1")).to_have_text(HOSTILE[0])
@@ -248,7 +248,7 @@ def test_hostile_text_stays_text(page, browser, videos):
     assert page.locator("img[onerror]").count() == 0
     assert page.locator("img").count() == len(HOSTILE)
     assert page.locator("script").count() == 2
-    # A page without the check, because the policy logs an error.
+    # Blocking logs an error, so this page must be opened without the check for errors.
     with browser.new_context() as context:
         page = context.new_page()
         open_report(page, videos, benchmark_report())

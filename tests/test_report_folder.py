@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports as a folder that needs nothing else, or as one file."""
+"""Test reports as a self-contained folder and as a single file."""
 
 import base64
 import hashlib
@@ -41,7 +41,7 @@ def sha256(path):
 
 
 def test_report_is_a_page_with_copies_of_media(recordings, tmp_path):
-    """It outlives the recordings; each step is reported."""
+    """The report works without the recordings, and each step's progress is reported."""
     hashes = [sha256(path) for path in sorted(recordings.glob("*.mp4"))]
     progress = []
     page = write_report(
@@ -66,7 +66,7 @@ def test_report_is_a_page_with_copies_of_media(recordings, tmp_path):
 
 
 def test_command_writes_a_report_of_several_directories(tmp_path, capsys, monkeypatch):
-    """It prints the page's path; `--json` prints it in full."""
+    """The command prints the path of the page; with `--json` the path is absolute."""
     monkeypatch.chdir(tmp_path)
     run = write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)]).parent
     verdict = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
@@ -102,7 +102,7 @@ def test_posters_show_the_middle_frame(recordings):
 
 
 def test_invalid_videos_are_named(recordings, tmp_path):
-    """A truncated video is copied; an HTML file with a video's name is not."""
+    """A truncated video is copied, but not an HTML file with the name of a video."""
     first, second = sorted(recordings.glob("*.mp4"))
     first.write_bytes(first.read_bytes()[:200])
     second.write_text("<html><script>alert(1)</script></html>")
@@ -128,7 +128,7 @@ def test_hostile_env_id_is_text_and_no_file_name(tmp_path):
 
 
 def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
-    """A report that fails leaves the older one."""
+    """If writing a report fails, the older report is kept."""
     (tmp_path / "report").mkdir()
     page = write_report(recordings, tmp_path / "report")
     before = page.read_text()
@@ -143,7 +143,7 @@ def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
     run = tmp_path / "run"
     run.mkdir()
-    # A directory with only a damaged file still has a report.
+    # Even a directory with nothing but a damaged file gets a report.
     (run / "openaigym.manifest.1.b.manifest.json").write_text("{")
     page = write_report(run, tmp_path / "report")
     assert names(tmp_path / "report") == ["index.html"]
@@ -155,7 +155,7 @@ def test_report_replaces_a_report_or_an_empty_folder(recordings, tmp_path):
     ("target", "mine", "options", "words"),
     [
         ("other", "other/index.html", {}, "index.html"),
-        # Reports with added files.
+        # Files were added to these reports, so they must not be replaced.
         ("report", "report/videos/mine.mp4", {}, "videos/mine.mp4"),
         ("report", "report/notes.txt", {}, "notes.txt"),
         ("recordings", "recordings/notes.txt", {}, "belong to a report"),
@@ -183,20 +183,20 @@ VIDEO = "<a [^>]*href=.data:video/mp4;base64,"
 
 
 def test_single_file_embeds_media_up_to_its_limit(recordings, tmp_path):
-    """Posters come first; the page counts missing videos."""
+    """Posters take precedence over videos, and the page counts missing videos."""
 
     def write(name, **options):
         page = write_report(recordings, tmp_path / name, single_file=True, **options)
         return page, page.read_text()
 
-    # It replaces itself, and may be in a folder.
+    # A single file can replace an older one, and can be in a folder.
     for name in ("one.html", "one.html", "folder"):
         page, text = write(name)
-        # Both videos are equal.
+        # Both videos are identical, so each occurs twice.
         for path in recordings.glob("*.mp4"):
             assert text.count(base64.b64encode(path.read_bytes()).decode()) == 2
         assert len(re.findall(VIDEO, text)) == len(re.findall(IMAGE, text)) == 2
-        # Browsers do not open pages at data addresses, so links download.
+        # Browsers do not open data URLs as pages, so links must download the video.
         assert all("download" in link for link in re.findall(VIDEO + "[^>]*", text))
     assert names(tmp_path / "folder") == ["index.html"]
     most = page.stat().st_size - 100
@@ -210,7 +210,7 @@ def test_single_file_embeds_media_up_to_its_limit(recordings, tmp_path):
 
 
 def test_replay_option_adds_three_pages_in_3d(tmp_path):
-    """They show the best, median and worst episode."""
+    """The pages show the best, the median and the worst episode."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
     record(env, tmp_path / "run", 4, height=48, width=64, video_callable=lambda _: True)
@@ -220,7 +220,7 @@ def test_replay_option_adds_three_pages_in_3d(tmp_path):
     links = re.findall(r'href="\./(replays/[^"]+)"', page.read_text())
     assert len(set(links)) == 3
     assert all("replay-data" in (page.parent / each).read_text() for each in links)
-    # Another report replaces it.
+    # A later report replaces this one.
     write_report(tmp_path / "run", tmp_path / "report")
     assert not (tmp_path / "report" / "replays").exists()
     with pytest.raises(InvalidArgument, match="Replays are separate pages"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The text and figures of report pages; `test_report_browser` opens them."""
+"""Test the text and figures of report pages without a browser."""
 
 import json
 import re
@@ -36,7 +36,7 @@ class Elements(HTMLParser):
 
 
 def data_of(page):
-    """Return the data of the page's script."""
+    """Return the data that the page embeds for its script."""
     found = re.search(r'id="episodes-data">(.*?)</script>', page, re.DOTALL)
     return json.loads(found[1])
 
@@ -48,7 +48,7 @@ def page_with(*videos):
 
 
 def test_hostile_text_stays_text():
-    """It adds no element, handler, style or invisible character."""
+    """Hostile text adds no element, handler, style or invisible character."""
     page = page_of(hostile_report())
     elements = Elements(page)
     assert len(elements.named("script")) == 2
@@ -59,7 +59,7 @@ def test_hostile_text_stays_text():
     assert not [name for name in attributes if name[:2] == "on" or name == "style"]
     assert not set("\u202e\u2028\x00\x1b") & set(page)
     assert r"abc\u202edef\u2028ghi" in page
-    # All addresses name files beside the page or places on it.
+    # All addresses must be files next to the page or anchors within it.
     addresses = [
         found[name]
         for _, found in elements.found
@@ -69,7 +69,7 @@ def test_hostile_text_stays_text():
     assert addresses
     assert all(re.match(r"\./|#|data:,$", address or "") for address in addresses)
     assert not re.search(r"https?://|url\(", page)
-    assert not re.search("x{1001}", page.split('id="videos"')[0])  # long text is cut
+    assert not re.search("x{1001}", page.split('id="videos"')[0])  # Long text is cut.
     assert data_of(page)["tasks"][1]["name"] == HOSTILE[1]
 
 
@@ -87,11 +87,11 @@ def test_video_card_shows_episode_size_command_and_rule():
         *(best.sha256, best.command),
     ):
         assert words in gallery
-    # This mark allows a later report to replace the page.
+    # A later report may replace the page only because of this mark.
     mark = {"name": "generator", "content": f"mjrec {version('mjrec')}"}
     assert mark in Elements(page).named("meta")
     assert page == page_with(best)
-    # A video outside the report has no player.
+    # A video that is not in the report has no player.
     page = page_with(replace(best, file=""))
     assert Elements(page).players() == []
     assert "./videos/a%20b.png" in page
@@ -121,17 +121,17 @@ def test_notes_explain_missing_and_different_figures():
     ]
     assert "<summary>1 left out</summary>" in page
     assert ">b</span>: no episode was completed</li>" in page
-    # The standard deviation divides by n - 1; one episode has none.
+    # The standard deviation divides by n - 1, so one episode has none.
     body = page.split('<table id="summary-table">')[1].split("</table>")[0]
     assert ">1.803</td>" in body
     assert 'data-value="">\N{EN DASH}</td>' in body
-    # Facts that all tasks share appear once.
+    # Facts that all tasks share appear only once.
     assert page.count("llvmpipe") == 1
     assert page.count("<dt>Seeds</dt>") == 4
 
 
 def test_page_of_many_episodes_holds_a_selection():
-    """It takes videos, failures, best and worst; some videos have players."""
+    """The page keeps the best and worst episodes and those with videos or failures."""
     returns = np.arange(30_000.0)
     returns[:3] = (-1e307, 0.123456789, 1e307)
     large = task("a", returns, failures={17_000: "boom"}, score_range=None)
@@ -146,7 +146,7 @@ def test_page_of_many_episodes_holds_a_selection():
     assert (rewards[0], rewards[2], rewards[17_000]) == (-1e307, 1e307, None)
     assert "evaluation/results.csv" in page
     assert "30\u202f000" in page
-    # The table links to the files of other videos.
+    # The table only links to the files of further videos.
     assert len(Elements(page).players()) == 300
     places = [
         listed["videos"][str(listed["episode"].index(15_000 + i))] for i in (599, 598)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes of Gymnasium-Robotics environments at the moment of drawing."""
+"""Test scenes of Gymnasium-Robotics environments."""
 
 import gymnasium
 import pytest
@@ -25,7 +25,7 @@ def _robots():
     [("PointMaze_UMaze-v3", "point_env"), ("FrankaKitchen-v1", "robot_env")],
 )
 def test_overridden_render_of_the_inner_environment_is_an_obstacle(env_id, inside):
-    """Mazes and the kitchen draw an inner environment."""
+    """Mazes and the kitchen render an inner environment."""
     env = gymnasium.make(env_id)
     drawn = drawn_part(env.unwrapped)
     assert drawn is getattr(env.unwrapped, inside)

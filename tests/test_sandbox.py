@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a sandboxed process reports its end."""
+"""Test how a sandboxed process reports its end."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ _ENDLESS = (
 
 
 def compiling(parent):
-    """Return the compiler's process; importing mujoco starts others."""
+    """Return the compiler's process, ignoring others that importing mujoco starts."""
     return [pid for pid in children(parent) if f"-m\0{_COMPILER}" in command_of(pid)]
 
 
@@ -34,7 +34,7 @@ def command_of(pid):
 
 
 def test_death_is_reported_with_status_and_traceback(tmp_path):
-    """An invalid request kills the process."""
+    """An invalid request makes the process fail."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
         assert list(sandbox.answers(60)) == []
         report = sandbox.last_words()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`save_video` keeps the contract of Gymnasium's `save_video`."""
+"""Test that `save_video` behaves like Gymnasium's `save_video`."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from mjrec.errors import InvalidArgument, UnknownName
 
 
 def shades(count, made=None):
-    """Yield one buffer with growing brightness; list the frames in `made`."""
+    """Yield one buffer with growing brightness; list the frame numbers in `made`."""
     buffer = np.empty((16, 16, 3), np.uint8)
     for number in range(count):
         if made is not None:
@@ -20,7 +20,7 @@ def shades(count, made=None):
 
 
 def shown(path):
-    """Return the numbers of a video's shades."""
+    """Return the frame numbers that a video's shades stand for."""
     return [round((frame.mean() - 20) / 6) for frame in frames_of(path)]
 
 
@@ -34,7 +34,7 @@ def test_default_is_the_capped_cubic_schedule(tmp_path, names):
 
 @pytest.mark.parametrize("kind", ["array", "generator"])
 def test_both_triggers_may_be_used(tmp_path, kind):
-    """Videos end after `video_length` frames, or with the last frame."""
+    """Videos end after `video_length` frames or with the last frame."""
     frames = shades(8)
     if kind == "array":
         frames = np.array([frame.copy() for frame in frames])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schedules of recorded episodes."""
+"""Test schedules of recorded episodes."""
 
 import doctest
 
@@ -11,13 +11,13 @@ from mjrec.schedules import schedule_from_text, schedule_name, to_schedule
 
 
 def test_cubes_below_1000_and_then_every_1000th():
-    """The docstring's example runs; the answer is a bool for any integer type."""
+    """The example in the docstring works; the result is a bool for any integer type."""
     chosen = [n for n in range(5000) if schedules.capped_cubic_video_schedule(n)]
     assert chosen == [n**3 for n in range(10)] + [1000, 2000, 3000, 4000]
     assert doctest.testmod(schedules).failed == 0
     assert schedules.capped_cubic_video_schedule(np.int64(27)) is True
     assert schedules.capped_cubic_video_schedule(-8) is False
-    # None means the default, as in gym.
+    # As in gym, None means the default.
     assert to_schedule(None) is schedules.capped_cubic_video_schedule
     assert to_schedule(max) is max
     for never in (False, 0, np.False_):
@@ -36,7 +36,7 @@ def test_cubes_below_1000_and_then_every_1000th():
     ],
 )
 def test_schedules_by_name(text, chosen, name):
-    """The manifest names them with their parameters."""
+    """The name of a schedule in the manifest includes its parameters."""
     schedule = schedule_from_text(text)
     assert [n for n in range(12) if schedule(n)] == chosen
     assert name in (None, schedule_name(schedule))

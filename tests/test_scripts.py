@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scripts of a checkout, as far as they need no download."""
+"""Test those parts of the scripts that need no download."""
 
 import os
 import shutil
@@ -33,7 +33,7 @@ def bash(checkout, command, **environment):
 
 
 def succeeds(checkout, condition):
-    """Return whether a shell function's exit status is 0."""
+    """Return whether a shell function succeeds."""
     answer = bash(checkout, SOURCE + condition)
     assert answer.returncode in (0, 1), answer.stderr
     return answer.returncode == 0
@@ -52,11 +52,11 @@ def test_help_installs_nothing(checkout, command):
 
 
 def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
-    """After a change to pyproject.toml, an interruption, or a move of the checkout."""
+    """Reasons are a changed pyproject.toml, an interruption or a moved checkout."""
     venv = checkout / ".venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
     assert not succeeds(checkout, IS_INSTALLED)
-    # The stamp of a finished installation.
+    # A finished installation leaves this stamp.
     stamp = '"$(stamp_of "$venv" demo)"'
     assert succeeds(checkout, f'describe_installation "$venv" -e . >{stamp}')
     assert succeeds(checkout, IS_INSTALLED)
@@ -68,7 +68,7 @@ def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
     with (checkout / "pyproject.toml").open("a") as project:
         project.write("\n# another\n")
     assert not succeeds(checkout, IS_INSTALLED)
-    # Scripts of a virtual environment contain its path.
+    # Scripts in a virtual environment contain its path, so it cannot be moved.
     assert not succeeds(checkout, MUST_BE_MADE_ANEW)
     assert succeeds(checkout.rename(tmp_path / "moved"), MUST_BE_MADE_ANEW)
 
@@ -84,7 +84,7 @@ def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
             *(f"{SOURCE} find_python", {"MJREC_PYTHON": "./old-python"}),
             ["Python 3.11 or 3.12", "./old-python is: Python 3.9.2", "MJREC_PYTHON="],
         ),
-        # Without permission to install, the error has the line to run.
+        # Without permission to install, the error shows the command to run.
         (
             f"{SOURCE} may_install() {{ false; }}; in_package_lists() {{ false; }}; "
             "install_required $(missing_egl)",
@@ -98,7 +98,7 @@ def test_installation_is_repeated_only_if_necessary(checkout, tmp_path):
     ids=["foreign directory", "old Python", "no libraries", "failed step"],
 )
 def test_errors_name_reason_and_remedy(checkout, command, environment, errors):
-    """A directory that the scripts did not make stays as it is."""
+    """Scripts do not change a directory that they did not create."""
     (checkout / "mine").mkdir()
     (checkout / "mine" / "thesis.tex").write_text("precious")
     old = checkout / "old-python"

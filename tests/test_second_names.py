@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Second names of videos."""
+"""Test second names of videos."""
 
 import json
 import os
@@ -24,7 +24,7 @@ ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side
 
 @pytest.fixture
 def video(tmp_path):
-    """The files of an episode with a further camera."""
+    """Write the files of an episode with two cameras, and return the first video."""
     return write_episode(tmp_path)
 
 
@@ -43,7 +43,7 @@ def second_names(directory):
 
 @pytest.mark.parametrize("has_hard_links", [True, False])
 def test_all_files_of_an_episode_have_second_names(video, monkeypatch, has_hard_links):
-    """A missing link is made again."""
+    """A missing link is created again."""
 
     def refuse(*_):
         raise OSError("no links here")
@@ -64,7 +64,7 @@ def test_all_files_of_an_episode_have_second_names(video, monkeypatch, has_hard_
 
 
 def test_copies_of_links_are_still_second_names(video, tmp_path, caplog):
-    """Copying a directory gives no warning, and the copies can be removed."""
+    """Copied second names cause no warning and can be removed."""
     give_second_names(video)
     copied = tmp_path / "copy"
     shutil.copytree(tmp_path, copied)
@@ -88,7 +88,7 @@ def test_foreign_file_of_that_name_stays(video, caplog):
 
 @pytest.mark.parametrize("way", ["hardlink_to", "symlink_to"])
 def test_clearing_removes_links_to_videos(way, video):
-    """Links of other names stay."""
+    """Links with other names are kept."""
     getattr(video.with_name(f"{SECOND}.mp4"), way)(video)
     os.link(video, video.with_name("my favourite.mp4"))
     video.with_suffix(".meta.json").unlink()

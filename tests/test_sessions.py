@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording sessions whose frames are drawn later, elsewhere, or never."""
+"""Test recording sessions whose frames are rendered later, elsewhere or never."""
 
 import importlib.util
 import json
@@ -53,7 +53,7 @@ def test_deferred_drawing_needs_no_gl(options, tmp_path):
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
 def test_missing_gl_error_suggests_deferred_drawing(tmp_path, render):
-    """For live frames there is no such advice."""
+    """If live frames were requested, the error must not suggest deferring them."""
     out = tmp_path / "out"
     with pytest.raises(GLError, match="Nothing renders here") as raised:
         list(record_session(session(out, render=render)))
@@ -80,7 +80,7 @@ def test_record_lists_pending_videos_and_their_command(tmp_path, capsys):
 )
 @pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
 def test_environment_that_cannot_be_drawn_gives_statistics(options, tmp_path, caplog):
-    """One line says that CartPole needs pygame; requested frames are an error."""
+    """A warning says that CartPole needs pygame; requesting frames is an error."""
     cart_pole = replace(
         session(tmp_path, name="CartPole", episodes=2, **options),
         made=EnvironmentOptions(max_steps=2),
@@ -95,7 +95,7 @@ def test_environment_that_cannot_be_drawn_gives_statistics(options, tmp_path, ca
 
 
 def test_record_chooses_a_backend_before_importing_mujoco(tmp_path):
-    """MuJoCo alone would choose one that needs a screen."""
+    """By itself, MuJoCo would choose a backend that needs a display."""
     environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
     command = [sys.executable, "-m", "mjrec", *RECORD, "--out", str(tmp_path)]
     subprocess.run(command, env=environ, check=True)

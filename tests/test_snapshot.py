@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Restored snapshots give the same scene, also into data full of NaN."""
+"""Test that restored snapshots give the same scene, even in data full of NaN."""
 
 import copy
 from pathlib import Path
@@ -22,7 +22,7 @@ from mjrec.simulation.snapshot import (
 from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView
 
-# A taut cable, a slack one whose limit is active already, and a colored one.
+# One cable is taut, one is slack with an active limit, and one is colored.
 TENDONS = """
 <mujoco>
   <worldbody>
@@ -42,7 +42,7 @@ TENDONS = """
 </mujoco>
 """
 
-# A small model with something for most visual options, and no skin.
+# Most visual options show something in this small model, which has no skin.
 THINGS = """
 <mujoco>
   <option timestep=".005"/>
@@ -81,7 +81,7 @@ def simulated(xml):
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.7
     data.xfrc_applied[-1, :3] = (1, 2, 3)
-    data.eq_active[1:] = False  # unlike in fresh data
+    data.eq_active[1:] = False  # By default, all are active.
     mujoco.mj_step(model, data, nstep=250 if xml == SHOWCASE else 5)
     return model, data
 
@@ -105,7 +105,7 @@ def row_of(model, data, option=None):
 
 
 def changed(row, **values):
-    """Return a snapshot with other arrays; None removes one."""
+    """Return a snapshot with some arrays replaced, or removed if given as None."""
     arrays = {name: row[name] for name in row.dtype.names} | values
     kept = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
     record = np.zeros(1, packed((n, (a.dtype, a.shape)) for n, a in kept.items()))
@@ -115,7 +115,7 @@ def changed(row, **values):
 
 
 def differences_of(model, data, option=None):
-    """Return the differences between the live scene and a restored one."""
+    """Return the differences between the live scene and the restored one."""
     row = row_of(model, data, option)
     fresh_model = copy.copy(model)
     fresh = mujoco.MjData(fresh_model)
@@ -151,7 +151,7 @@ def test_restored_snapshot_gives_the_same_scene(xml):
     ],
 )
 def test_invalid_snapshot_is_refused(name, value, words):
-    """MuJoCo would read out of bounds."""
+    """With an invalid snapshot, MuJoCo would read out of bounds."""
     model, data = simulated(TENDONS)
     row = row_of(model, data)
     if isinstance(value, int):
@@ -162,7 +162,7 @@ def test_invalid_snapshot_is_refused(name, value, words):
 
 
 FLAGS = [[name] for name in mujoco.mjtVisFlag.__members__][:-1]
-# Flags that need another one.
+# These flags show nothing without another flag.
 FLAGS += [["mjVIS_ACTUATOR", "mjVIS_ACTIVATION"], ["mjVIS_INERTIA", "mjVIS_SCLINERTIA"]]
 FRAMES = [[name] for name in mujoco.mjtFrame.__members__][:-1]
 LABELS = [[name] for name in mujoco.mjtLabel.__members__][:-1]
@@ -190,7 +190,7 @@ def test_every_flag_frame_and_label_is_exact_or_refused(shown, xml):
 
 
 def test_yielded_tendon_spring_is_restored():
-    """Since mujoco 4 a cable's sag depends on its history."""
+    """Since mujoco 4, the sag of a cable depends on its history."""
     xml = TENDONS.replace(
         "<spatial><site",
         '<spatial springlength="0 .4" stiffness="1" springyield="1"><site',
@@ -218,7 +218,7 @@ def test_yielded_tendon_spring_is_restored():
     ],
 )
 def test_self_check_notices_a_missing_field(xml, field, words):
-    """A later MuJoCo may read other fields; the check writes nothing."""
+    """Later versions of MuJoCo may read more fields; the check itself writes none."""
     model, data = simulated(xml)
     shown = view(model, None)
     if field == "cam_xpos":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training with Stable-Baselines3: vector environments, evaluation, result readers."""
+"""Test training, evaluation and result readers of Stable-Baselines3."""
 
 import importlib.util
 import json
@@ -16,10 +16,10 @@ import mjrec
 from mjrec.trackers import MonitorCsvTracker, Run
 
 if importlib.util.find_spec("stable_baselines3") is None:
-    # Naming this file bypasses conftest.py's `collect_ignore`.
+    # If this file is named, pytest ignores `collect_ignore` in conftest.py.
     pytest.skip("scripts/test --all installs it", allow_module_level=True)
 
-# Before pyplot looks for a display.
+# Set this before pyplot looks for a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import torch
@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.stable_baselines3, pytest.mark.timeout(120)]
 
 STEPS = 256
 
-# Far faster for small networks on busy cores.
+# A single thread is far faster for small networks on busy cores.
 torch.set_num_threads(1)
 
 
@@ -66,7 +66,7 @@ def test_training_is_recorded(tmp_path):
     assert manifest_of(tmp_path)["mjrec"]["pending"] == []
     read = load_results(str(tmp_path))
     assert list(read["r"]) == rewards_in(tmp_path)
-    # The last episode did not end, so its steps are missing.
+    # The last episode did not end, so its steps are not counted.
     steps, returns = ts2xy(read, "timesteps")
     assert steps[-1] == sum(entry["length"] for entry in journal_of(tmp_path)) <= STEPS
     assert list(returns) == rewards_in(tmp_path)
@@ -82,14 +82,14 @@ def test_stable_baselines3_logs_episode_info(tmp_path):
     assert rewards_in(tmp_path) == pytest.approx(returns)
 
 
-# From Python 3.12 on, `fork` beside torch's threads warns.
+# From Python 3.12 on, `fork` warns because torch has threads.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 @pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver", "fork"])
 def test_monitors_in_a_vector_environment_share_a_directory(kind, tmp_path):
-    """Scheduled videos are there after `close`."""
+    """Scheduled videos exist after `close`."""
 
     def make(index):
-        # Pickled into another process, which cannot import this module.
+        # This is pickled for a process that cannot import this module.
         def make_monitored():
             import gymnasium
 
@@ -150,7 +150,7 @@ def test_evaluation_is_recorded(tmp_path):
 
 
 def test_files_of_several_runs_are_read_together(tmp_path):
-    """They are in the order of their ends."""
+    """The episodes are sorted by the time at which they ended."""
     tracker = MonitorCsvTracker()
     runs = [
         Run(directory=tmp_path, infix=f"{i}.1", env_id="x", env_index=i)

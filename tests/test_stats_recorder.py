@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`StatsRecorder` writes statistics of complete episodes."""
+"""Test that `StatsRecorder` writes statistics of complete episodes."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def test_only_complete_episodes_are_written(recorder):
     ("rewards", "total"),
     [
         ([1, np.array([1.0]), np.array(1), np.int8(1), True], 5.0),
-        # float32 would lose the ones.
+        # A sum in float32 would lose the ones.
         ([np.float32(1e8), np.float32(1), np.float32(1)], 1e8 + 2),
         *(([value], value) for value in (math.nan, math.inf, -math.inf)),
     ],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timeouts without progress."""
+"""Test timeouts without progress."""
 
 import time
 
@@ -22,7 +22,7 @@ def test_environment_variable_sets_the_timeout(monkeypatch):
 
 
 def test_time_asleep_does_not_count(monkeypatch):
-    """An hour asleep counts as one wait; progress restarts the timeout."""
+    """An hour of sleep counts as a single wait; progress restarts the timeout."""
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     timeout = Timeout(120)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Importing trackers, and `monitor.csv` as text."""
+"""Test importing trackers, and the text of `monitor.csv`."""
 
 import dataclasses
 import json
@@ -52,7 +52,7 @@ def run(tmp_path):
 
 
 def test_header_and_rows(run):
-    """Times count from the header's; rewards are exact."""
+    """Times are relative to the time in the header, and rewards are exact."""
     before = time.time()
     tracker = MonitorCsvTracker()
     tracker.begin(run)
@@ -76,7 +76,7 @@ def test_header_and_rows(run):
 
 
 def test_each_run_has_its_own_file(run, tmp_path, monkeypatch):
-    """A relative path is resolved at construction."""
+    """A relative path is resolved when the tracker is created."""
     (tmp_path / "logs").mkdir()
     monkeypatch.chdir(tmp_path)
     tracker = MonitorCsvTracker("logs")
@@ -99,7 +99,7 @@ def test_each_run_has_its_own_file(run, tmp_path, monkeypatch):
     ],
 )
 def test_existing_files_are_never_written_to(run, path, made, tmp_path):
-    """The tracker takes the next free name that Stable-Baselines3 finds."""
+    """The tracker uses the next free name that Stable-Baselines3 would find."""
     first = tmp_path / "logs" / max(made)
     first.parent.mkdir()
     first.write_text("precious")
@@ -114,7 +114,7 @@ def test_existing_files_are_never_written_to(run, path, made, tmp_path):
 
 
 def test_full_disk_is_an_error_and_tears_no_row(run):
-    """Half a row would be read as another one."""
+    """Half a row would be read as a different, valid row."""
     tracker = MonitorCsvTracker()
     tracker.begin(run)
     [path] = run.directory.iterdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TensorBoard event files, read back by TensorBoard's own reader."""
+"""Test event files with TensorBoard's own reader."""
 
 import dataclasses
 import io
@@ -19,7 +19,7 @@ from mjrec.trackers.tensorboard import animated_gif
 
 @pytest.fixture
 def finished(tmp_path, make_corridor, play):
-    """A video of eleven frames at ten frames a second."""
+    """Return a finished video of eleven frames at ten frames per second."""
     return record(tmp_path / "recordings", make_corridor(10), play)
 
 
@@ -30,7 +30,7 @@ def read(directory):
 
 
 def test_scalars_are_logged_at_the_steps_of_the_run(finished):
-    """Success only where it is known; evaluation has its own tags."""
+    """Success is logged only if it is known, and evaluation has tags of its own."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode(0, success=True))
@@ -48,7 +48,7 @@ def test_scalars_are_logged_at_the_steps_of_the_run(finished):
 
 
 def test_video_is_logged_as_an_animated_gif(finished):
-    """It has all frames, at the last step of its episode."""
+    """The GIF has all frames and is logged at the last step of its episode."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode(0))
@@ -67,13 +67,13 @@ def test_video_is_logged_as_an_animated_gif(finished):
         assert opened.n_frames == 11
         assert opened.info["duration"] == 100
         assert opened.info["loop"] == 0
-        # The bar grows by four pixels a step.
+        # The bar grows by four pixels with each step.
         for step in (0, 5, 10):
             opened.seek(step)
             frame = opened.convert("RGB")
             assert frame.getpixel((4 * step + 1, 16))[0] > 150
             assert frame.getpixel((min(4 * step + 7, 47), 16))[0] < 60
-    # A long video keeps its duration with fewer frames.
+    # A long video keeps its duration but is shown with fewer frames.
     long = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
     with Image.open(io.BytesIO(long)) as opened:
         assert opened.n_frames <= 100
@@ -109,12 +109,12 @@ def test_runs_have_their_own_names(finished, tmp_path):
 
 
 def test_damaged_files_are_named(finished, tmp_path):
-    """Errors of ffmpeg are raised by `end` at the latest; earlier events stay."""
+    """Errors of ffmpeg are raised by `end` at the latest; earlier events are kept."""
     finished.video.path.write_bytes(b"no video")
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode())
-    # Events are flushed at once, so a killed process loses none.
+    # Events are flushed immediately, so a killed process loses none.
     assert read(run.directory / "tensorboard" / "0.4711").Scalars("training/return")
     tracker.video(run, finished.video)
     finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights & Biases, offline; its files are read back."""
+"""Test Weights & Biases offline by reading the files it writes."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from mjrec.trackers import WandbTracker
 
 @pytest.fixture(autouse=True)
 def quiet(monkeypatch):
-    """Touch no account or console, and end every run."""
+    """Keep wandb away from accounts and the console, and end every run."""
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("WANDB_CONSOLE", "off")
     yield
@@ -32,7 +32,7 @@ def offline(directory):
 
 
 def log_of(directory):
-    wandb.teardown()  # flushes finished runs
+    wandb.teardown()  # This flushes finished runs.
     [path] = directory.glob("wandb/offline-run-*/*.wandb")
     return path
 
@@ -42,7 +42,7 @@ def logged(directory, key):
 
 
 def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
-    """Evaluation and sub-environments have keys of their own."""
+    """Evaluation and sub-environments have their own keys."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     second = dataclasses.replace(run, infix="1.4711", env_index=3)
     for each in (run, second):
@@ -51,7 +51,7 @@ def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
     tracker.episode(run, episode(1))
     tracker.episode(run, episode(2, type="e"))
     tracker.end(run)
-    # The tracker's run ends with its last monitor.
+    # The tracker's run ends when its last monitor ends.
     tracker.episode(second, episode(3))
     tracker.end(second)
     assert wandb.run is None
@@ -67,7 +67,7 @@ def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
 
 
 def test_late_video_is_logged_at_its_own_step(finished, tmp_path):
-    """The file is copied byte for byte."""
+    """The video file is copied byte for byte."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     tracker.begin(run)
     for number in range(3):
@@ -89,7 +89,7 @@ def test_late_video_is_logged_at_its_own_step(finished, tmp_path):
 
 @pytest.mark.parametrize("how", ["given", "active", "beside"])
 def test_foreign_run_stays_open(how, finished, tmp_path):
-    """With options, the tracker makes and ends a run of its own."""
+    """A tracker with options starts and ends a separate run."""
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()
     theirs = wandb.init(**offline(tmp_path / "theirs"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events that trackers receive."""
+"""Test the events that trackers receive."""
 
 import gymnasium
 import numpy as np
@@ -10,7 +10,7 @@ from mjrec.recorder.tracking import Tracker
 
 
 class RecordingTracker(Tracker):
-    """Records all events, and raises at those in `fails`."""
+    """A tracker that records all events and raises an error at those in `fails`."""
 
     def __init__(self, fails=()):
         self.events, self.fails = [], fails
@@ -67,7 +67,7 @@ def test_tracker_receives_episodes_and_live_videos_in_order(tmp_path):
 
 
 def test_tracker_receives_each_deferred_video_once_finished(tmp_path):
-    """It never receives pending videos."""
+    """A tracker never receives pending videos."""
     tracker, pending = RecordingTracker(), RecordingTracker()
     record(tmp_path, tracker)
     videos = tracker.of("video")
@@ -80,7 +80,7 @@ def test_tracker_receives_each_deferred_video_once_finished(tmp_path):
 
 
 def test_failing_tracker_is_dropped_and_others_continue(tmp_path, caplog):
-    """The log and the manifest have the reason."""
+    """The log and the manifest say why the tracker was dropped."""
     failing, other = RecordingTracker(("episode", "end")), RecordingTracker()
     record(tmp_path, failing, other, render="live")
     assert [kind for kind, *_ in failing.events] == ["begin", "episode", "end"]

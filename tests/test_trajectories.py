@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes as arrays, with the model of each step."""
+"""Test reading recorded episodes as arrays, with the model of each step."""
 
 import gymnasium
 import mujoco
@@ -14,13 +14,13 @@ from mjrec.formats.trajectory_file import finish_trajectory
 
 
 def record(directory, change=lambda step, model: None, **options):
-    """Record twelve steps; return the recording in flight, and its arrays."""
+    """Record twelve steps; return the recording in flight and the expected arrays."""
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=12)
     options = {"workers": 0, "observations": True, **options}
     monitor = mjrec.Monitor(env, directory, **options)
     model, data = env.unwrapped.model, env.unwrapped.data
     change(0, model)
-    monitor.reset(seed=3)  # replaced by the next reset
+    monitor.reset(seed=3)  # The next reset replaces this one.
     arrays = {"observations": [monitor.reset(seed=7)[0]], "qpos": [data.qpos.copy()]}
     arrays |= {"actions": [], "rewards": []}
     for step in range(1, 13):
@@ -36,7 +36,7 @@ def record(directory, change=lambda step, model: None, **options):
 
 
 def in_both_forms(path):
-    """Load the recording in flight, then the finished file."""
+    """Yield the trajectory loaded in flight, then loaded from the finished file."""
     yield mjrec.load_trajectory(str(path))
     yield mjrec.load_trajectory(finish_trajectory(path))
 
@@ -111,7 +111,7 @@ def test_recording_without_a_simulation_has_rewards_but_no_model(
 
 
 def test_reading_needs_no_simulator(tmp_path):
-    """Arrays are read on a machine without mujoco; a model is not."""
+    """Arrays can be read without mujoco, but a model cannot."""
     path = finish_trajectory(record(tmp_path)[0])
     code = (
         "import sys; sys.modules.update(mujoco=None, gymnasium=None)\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounded worker thread; `test_video_writer` tests its use."""
+"""Test the bounded worker thread."""
 
 import pytest
 from other_python import run_python
@@ -9,7 +9,7 @@ from mjrec.worker_thread import WorkerThread
 
 @pytest.mark.parametrize("end", [WorkerThread.close, WorkerThread.abort])
 def test_ending_a_worker_on_its_own_thread_does_not_block(end):
-    """Garbage collection in the consumer may end the worker's owner."""
+    """Garbage collection on the worker's own thread may finalize its owner."""
     ended = []
     worker = WorkerThread(lambda _: ended.append(end(worker)), capacity=5, name="w")
     worker.put(1)
@@ -18,7 +18,7 @@ def test_ending_a_worker_on_its_own_thread_does_not_block(end):
 
 
 def test_forks_and_interpreter_exit_do_not_wait_for_the_thread():
-    """A fork's `put` raises; a script with a hanging consumer still exits."""
+    """In a fork, `put` raises an error; a hanging consumer does not block the exit."""
     code = (
         "import os, threading\n"
         "from mjrec.errors import ClosedError\n"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builders of trajectories, without a simulation.
+"""Build trajectories without a simulation.
 
-Their frame k has the brightness `grey(k)` and a white pixel in a corner. `Painter`
-draws it from the snapshots.
+Frame k has the brightness `grey(k)` and a white pixel in a corner. `Painter` renders
+frames from the snapshots.
 """
 
 import itertools
@@ -34,19 +34,19 @@ GREY_ROWS = row_dtype(
 
 
 def grey(frame):
-    """Return the brightness of a frame."""
+    """Return the brightness of a frame by its number."""
     return 10 + 20 * frame
 
 
 class Painter:
-    """Draws frames of trajectories of this module, in place of `WorkerPool`.
+    """A replacement for `WorkerPool` that renders trajectories of this module.
 
-    Frames of a requested camera are a little brighter; `plain` leaves out the white
+    If a camera is requested, frames are a little brighter; `plain` omits the white
     pixel. `asked` and `tiles` list the requests, and `breaks_at` is called before each
-    frame with trajectory, view and index.
+    frame with its trajectory, view and index.
     """
 
-    gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as WorkerPool has it
+    gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as in WorkerPool
 
     def __init__(self, size=(16, 24), *, plain=False):
         self.size = size
@@ -75,7 +75,7 @@ class Painter:
 
 
 def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
-    """Return a writer of recordings, whose numbers follow existing ones."""
+    """Return a writer of recordings that continues the existing numbers."""
     used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
     return SpanLogs(
         directory,
@@ -87,7 +87,7 @@ def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
 
 
 def add_row(span, step, **values):
-    """Add a row with these columns; a snapshot makes it a frame."""
+    """Add a row with these columns; it counts as a frame if it has a snapshot."""
     slot = span.make_room()
     known = ("reward", "terminated", "truncated", "is_step")
     commit = {key: values.pop(key) for key in known if key in values}
@@ -111,7 +111,7 @@ def write_log(
     fps=None,
     **facts,
 ):
-    """Record an episode; `ended` adds its last event, `over` marks its last row."""
+    """Record an episode; `ended` adds its end event, and `over` marks its last row."""
     logs = new_logs(directory, infix)
     name = trajectory_prefix(infix, episode_id)
     if video:
@@ -162,7 +162,7 @@ def write_finished(directory, episode_id=0, **rest):
 
 
 def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
-    """Write the manifest of a closed monitor with only pending videos."""
+    """Write the manifest of a closed monitor that has only pending videos."""
     path = directory / manifest_name(infix)
     pending = [
         {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All of a trajectory as arrays, to be compared."""
+"""Read a whole trajectory as arrays that can be compared."""
 
 from dataclasses import dataclass
 from typing import Any

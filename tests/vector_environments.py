@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vector environments for the tests; none needs a simulator."""
+"""Vector environments for tests, without a simulator."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ DISABLED = AutoresetMode.DISABLED
 
 
 class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Draws one corridor per sub-environment, 16 pixels wide for each step."""
+    """A vector environment whose corridors grow by 16 pixels with each step."""
 
     def __init__(
         self, lengths=(2, 3), mode=NEXT_STEP, *, render_mode="rgb_array", heights=None
@@ -89,7 +89,7 @@ def _frame(position, height):
 
 
 def play(env, steps, *, seed=None):
-    """Reset, then take steps; mode DISABLED needs a masked reset after each episode."""
+    """Reset, then take steps; in mode DISABLED, also reset after each episode."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
     for _ in range(steps):
@@ -105,7 +105,7 @@ def path_of(monitor, episode, ending):
 
 
 def shown(path, *, step=4):
-    """Return the corridor positions in a video."""
+    """Return the positions in the corridor that a video shows."""
     columns = [int((frame[0, :, 0] > 128).sum()) for frame in frames_of(path)]
     return [round(count / step) - 1 for count in columns]
 

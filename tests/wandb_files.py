@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads files of offline runs of Weights & Biases.
+"""Read files of offline runs of Weights & Biases.
 
-Its packages have had no reader since 0.31. The format is LevelDB's log behind a header
-of seven bytes: blocks of 32 KiB of pieces, each with checksum and length. A record is
-one whole piece (1), or a first (2), middle ones (3) and a last one (4).
+wandb has had no reader of its own since 0.31. After a header of seven bytes, the format
+is LevelDB's log: 32 KiB blocks of pieces, each with a checksum and a length. A record
+is one whole piece (1), or a first piece (2), middle pieces (3) and a last one (4).
 """
 
 import json
@@ -25,7 +25,7 @@ def records(path):
 
 
 def history(path):
-    """Return logged rows, without keys of W&B itself."""
+    """Return the logged rows without W&B's own keys."""
     return [
         _row(record.history.item)
         for record in records(path)
@@ -34,7 +34,7 @@ def history(path):
 
 
 def axes(path):
-    """Return the axis of each metric or pattern."""
+    """Return the axis of each metric or pattern by name."""
     metrics = [r.metric for r in records(path) if r.HasField("metric")]
     return {m.name or m.glob_name: m.step_metric for m in metrics if m.step_metric}
 
@@ -42,7 +42,7 @@ def axes(path):
 def _row(items):
     row = {}
     for item in items:
-        # A video is several nested items.
+        # A video is stored as several nested items.
         *outer, last = list(item.nested_key) or [item.key]
         inner = row
         for key in outer:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints what gym's own `load_results` makes of directories, as one JSON object.
+"""Print what gym's own `load_results` returns for directories, as one JSON object.
 
-Run in an environment that holds gym 0.21.0, beside the directories, whose names are the
-object's keys. So `answers.json` was made::
+The keys of the object are the names of the directories. Run the script in an
+environment with gym 0.21.0. These commands made `answers.json`::
 
     cd tests/data/gym
     python ../../legacy/gym_load_results.py [0-9]*/* ours > answers.json
 
-`ours` was written by `write_ours` of `test_results_gym.py`, and removed again.
-Where gym raises, the value is `{"error": ...}`.
+`write_ours` in `test_results_gym.py` wrote the temporary directory `ours`.
+If gym raises an error, the value is `{"error": ...}`.
 """
 
 import importlib.metadata
@@ -16,12 +16,12 @@ import json
 import os
 import sys
 
-# Gym looks for plugins in a way that Python 3.12 does not know any more.
+# Gym finds plugins through an API that Python 3.12 removed.
 importlib.metadata.entry_points = dict
 
-from gym.wrappers import monitor  # noqa: E402  after the line above
+from gym.wrappers import monitor  # noqa: E402  needs the line above
 
-# Gym takes the order in which the file system lists the files, which is any.
+# Gym reads files in the order of `os.listdir`, which is arbitrary.
 listdir = os.listdir
 os.listdir = lambda path: sorted(listdir(path))
 
@@ -34,4 +34,4 @@ def load(directory):
 
 
 results = {directory: load(directory) for directory in sys.argv[1:]}
-print(json.dumps(results, indent=1))  # noqa: T201  read by the test
+print(json.dumps(results, indent=1))  # noqa: T201  the tests read it

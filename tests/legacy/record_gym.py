@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records the directories under tests/data/gym/<version>/ with a real gym.
+"""Record the directories under tests/data/gym/<version>/ with a real gym.
 
-Run in an environment that holds one gym from 0.7.4 to 0.22 and numpy<1.24::
+Run the script in an environment with gym 0.7.4 to 0.22 and numpy<1.24::
 
     python tests/legacy/record_gym.py tests/data/gym
 
-It runs on Python 3.6, which is as new as some gyms allow, so its style is old.
+The code must run on Python 3.6, because some versions of gym need it.
 """
 
 import multiprocessing
@@ -20,9 +20,9 @@ from gym import version, wrappers
 
 
 class Tiny(gym.Env):
-    """Counts to `length`; both gym's old method names (`_step`) and its new ones."""
+    """An environment that counts steps, with gym's old (`_step`) and new methods."""
 
-    metadata = {"render.modes": ["ansi"], "video.frames_per_second": 2}  # noqa: RUF012 gym's own idiom
+    metadata = {"render.modes": ["ansi"], "video.frames_per_second": 2}  # noqa: RUF012 as in gym
     observation_space = gym.spaces.Discrete(100)
     action_space = gym.spaces.Discrete(2)
 
@@ -112,7 +112,7 @@ def not_finite(directory):
 
 
 def two_monitors(directory):
-    """Two that took turns, and a third, in evaluation, that only began."""
+    """Two monitors take turns, and a third, in evaluation, takes only one step."""
     first, idle, second = [
         monitor(directory, resume=True, mode=mode)
         for mode in ("training", "evaluation", "evaluation")
@@ -154,7 +154,7 @@ def main(root):
     shutil.rmtree(str(target), ignore_errors=True)
     for case in CASES:
         directory = str(target / case.__name__)
-        # A process for each, because a process counts its monitors.
+        # Gym numbers the monitors of a process, so each case needs a new process.
         process = multiprocessing.Process(target=case, args=(directory,))
         process.start()
         process.join()
