@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chromium, problems of its pages, and a live view to open in it."""
+"""Chromium, problems of its pages, and live views and replays to open in it."""
 
 import contextlib
+import json
 import shutil
 import threading
 
@@ -68,3 +69,8 @@ def served(directory):
         finally:
             view.close()
             thread.join()
+
+
+def data_of(page):
+    """Return the data that the script of a replay's page reads."""
+    return json.loads(page.split('id="replay-data">')[1].split("</script>")[0])

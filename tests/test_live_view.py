@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 import gymnasium
 import numpy as np
 import pytest
-from browsers import served
+from browsers import data_of, served
 
 import mjrec
 from mjrec.commands import main
@@ -119,8 +119,7 @@ def test_a_page_reloads_once_when_a_tendon_begins_to_wrap(tmp_path):
     assert main(["record", str(tmp_path / "model.xml"), *options]) == 0
 
     def page():
-        text = urllib.request.urlopen(view.url).read().decode()
-        data = json.loads(text.split('id="replay-data">')[1].split("</script>")[0])
+        data = data_of(urllib.request.urlopen(view.url).read().decode())
         segments = [name for name in data["nodes"] if name.startswith("/tendon/")]
         return data["scene"], len(segments)
 

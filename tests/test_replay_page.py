@@ -2,7 +2,6 @@
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
 import io
-import json
 import re
 import subprocess
 import sys
@@ -11,7 +10,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from browsers import barriers_of, chromium, complaints_of, served
+from browsers import barriers_of, chromium, complaints_of, data_of, served
 from parts import parametrize
 from PIL import Image
 from robots import robots_that_reset
@@ -107,7 +106,7 @@ _VERTICES = """(name, kind = "position") => {
 }"""
 _NORMALS = f"(name) => ({_VERTICES})(name, 'normal')"
 # Collects the text that the page writes on its curve.
-_NOTE_TEXT = """() => {
+_COLLECT_TEXT = """() => {
   window.drawnText = [];
   const context = CanvasRenderingContext2D.prototype, write = context.fillText;
   context.fillText = function (text, ...rest) {
@@ -250,12 +249,6 @@ def data_at(trajectory, step):
     return data
 
 
-def data_in(page):
-    """Return the data that a page's script reads."""
-    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
-    return json.loads(text)
-
-
 def numbers_in(text):
     """Return the reward and the return that the page shows."""
     return list(map(float, re.search(r"reward (.+?),.*return (\S+)", text).groups()))
@@ -295,7 +288,7 @@ def test_geoms_skins_and_free_cameras_are_where_mujoco_has_them(name, pages, tmp
     file = replay_of(path, tmp_path).path
     page = pages(f"{file.as_uri()}#step={_STEPS}")
     check_geoms(page, data_at(mjrec.load_trajectory(path), _STEPS))
-    shown = data_in(file)
+    shown = data_of(file.read_text())
     if shown["camera"] == "free":
         position, _ = page.evaluate(_CAMERA)
         assert position == pytest.approx(shown["view"]["position"], abs=1e-4)
@@ -418,7 +411,7 @@ def test_the_curve_shows_the_step_under_the_cursor_and_a_click_goes_to_it(
     page, cheetah
 ):
     rewards = mjrec.load_trajectory(cheetah).rewards
-    page.evaluate(_NOTE_TEXT)
+    page.evaluate(_COLLECT_TEXT)
     curve = page.locator("#replay-curve")
     width = curve.bounding_box()["width"]
     place = {"x": width * 3 / _STEPS, "y": 5}
@@ -587,7 +580,7 @@ def test_geoms_change_color_appear_and_vanish_as_in_the_model(tmp_path):
     trajectory.states[0] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.notes == ("States left out because they are not finite: 1 of 5.",)
-    data = data_in(made.path)
+    data = data_of(made.path.read_text())
     assert data["rgba"]["/geom/2"][3] == 0
     changes = {name: (at, rgba) for at, name, rgba in data["chunk"]["colours"]}
     assert len(changes) == len(data["chunk"]["colours"]) == 3
@@ -601,7 +594,7 @@ def test_the_view_follows_the_first_tree_with_a_joint(tmp_path):
     trajectory = recorded_model(_PICKER, tmp_path, steps=2)
     page = mjrec.write_replay(trajectory, tmp_path / "page.html").path
     centre = data_at(trajectory, 0).body("arm").subtree_com
-    assert data_in(page)["start"] == pytest.approx(centre)
+    assert data_of(page.read_text())["start"] == pytest.approx(centre)
 
 
 def check_note(made, note, caplog):
