@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chromium, and what it says of a page."""
+"""Chromium, problems of its pages, and live views and replays to open in it."""
 
 import contextlib
+import json
 import shutil
+import threading
 
-# No sandbox, which root and most containers cannot have: it opens our own pages only.
+# Root and most containers cannot have a sandbox, and all pages are our own.
 _OPTIONS = (
     *("--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update"),
@@ -14,8 +16,8 @@ _OPTIONS = (
 
 @contextlib.contextmanager
 def chromium():
-    """Yield what starts the system's Chromium, or the one that Playwright has."""
-    # Here, because the environments without a browser have no Playwright.
+    """Yield a function that starts the system's Chromium, or else Playwright's."""
+    # Environments without a browser have no Playwright.
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -24,24 +26,26 @@ def chromium():
 
 
 def complaints_of(page, own):
-    """Return the list of the page's errors and dialogs to come, and of its requests.
+    """Return a list that collects a page's errors, dialogs and foreign requests.
 
     Args:
         page: a new page.
-        own: beginnings of the addresses that it may ask for.
+        own: the prefixes of URLs that it may request.
     """
-    said = []
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("dialog", lambda shown: said.append(f"dialog: {shown.message}"))
-    page.on(
-        "request",
-        lambda asked: None if asked.url.startswith(own) else said.append(asked.url),
-    )
-    return said
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda shown: complaints.append(f"dialog: {shown.message}"))
+
+    def check(request):
+        if not request.url.startswith(own):
+            complaints.append(request.url)
+
+    page.on("request", check)
+    return complaints
 
 
 def barriers_of(page, **options):
-    """Return what axe-core finds that keeps people out of a page."""
+    """Return the serious accessibility problems that axe-core finds in a page."""
     from axe_playwright_python.sync_playwright import Axe
 
     return [
@@ -49,3 +53,24 @@ def barriers_of(page, **options):
         for each in Axe().run(page, **options).response["violations"]
         if each["impact"] in ("serious", "critical")
     ]
+
+
+@contextlib.contextmanager
+def served(directory):
+    """Yield a live view of a directory, served by a thread."""
+    # It needs packages that environments without a browser lack.
+    from mjrec.viewing.live import LiveView
+
+    with LiveView(directory) as view:
+        thread = threading.Thread(target=view.serve)
+        thread.start()
+        try:
+            yield view
+        finally:
+            view.close()
+            thread.join()
+
+
+def data_of(page):
+    """Return the data that the script of a replay's page reads."""
+    return json.loads(page.split('id="replay-data">')[1].split("</script>")[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished recordings, and what a tracker is told of them."""
+"""Finished recordings as trackers receive them."""
 
 import time
 import types
@@ -9,7 +9,7 @@ from mjrec.trackers import FinishedEpisode, FinishedVideo, Run
 
 
 def episode(number=0, **facts):
-    """Return an episode of ten steps; the run had no others."""
+    """Return an episode of ten steps after others of ten steps."""
     now = time.time()
     usual = {
         "episode_id": number,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handlers of jobs that do what policies and environments do on a bad day."""
+"""Handlers of jobs that crash, hang, print and misbehave like users' code."""
 
 import contextlib
 import logging
@@ -15,7 +15,7 @@ from mjrec.engines.worker import time_limit
 
 
 class OddJobs:
-    """Does what a job's `do` names."""
+    """Calls the method that a job's `do` names."""
 
     def __init__(self, settings):
         self._settings = settings
@@ -40,7 +40,7 @@ class OddJobs:
         }
 
     def die(self, arguments):
-        """End the process; where `once` names a file, only if there is none yet."""
+        """Kill this process, unless the file `once` exists already."""
         if "once" in arguments:
             try:
                 Path(arguments["once"]).touch(exist_ok=False)
@@ -69,13 +69,13 @@ class OddJobs:
         return {"read": sys.stdin.read()}
 
     def meet(self, arguments):
-        """Wait until another job has opened the other end of a pipe."""
+        """Wait until another job opens the other end of a pipe."""
         with Path(arguments["pipe"]).open(arguments["mode"]):
             gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
             return {"pid": os.getpid(), "gpus": gpus}
 
     def hold(self, arguments):
-        """Keep at it until a file is there; lines of another say who has begun."""
+        """Write the process id to the file `begun`; wait for the file `go`."""
         with Path(arguments["begun"]).open("a") as file:
             file.write(f"{os.getpid()}\n")
         go = Path(arguments.get("go", "/no/such/file"))
@@ -85,7 +85,7 @@ class OddJobs:
         return {"pid": os.getpid()}
 
     def hang(self, arguments):
-        """Hold the interpreter for minutes, where there is no file yet."""
+        """Hold the interpreter for minutes, unless the file `mark` exists."""
         import re
 
         mark = Path(arguments["mark"])
@@ -95,7 +95,7 @@ class OddJobs:
         return {"mark": mark.read_text()}
 
     def fork(self, arguments):
-        """Die, and leave a child of another session that goes on."""
+        """Kill this process, but leave a running child in a session of its own."""
         child = subprocess.Popen(["sleep", "600"], start_new_session=True)
         with Path(arguments["children"]).open("a") as file:
             file.write(f"{child.pid}\n")
@@ -121,7 +121,7 @@ def make_and_die(settings):
 
 
 def make_one(settings):
-    """The first begins; all others die, each noting that."""
+    """Return a handler in the first process; kill all others, which leave files."""
     place = Path(settings["place"])
     try:
         (place / "first").touch(exist_ok=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that a process, mostly the tests' own, has started."""
+"""Child processes: finding, killing and forking them."""
 
 import functools
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def children(of="self"):
-    """Return those that are still there, zombies too, but not multiprocessing's own."""
+    """Return a process's children, zombies too, but not multiprocessing's helpers."""
     own = re.compile(b"resource_tracker|forkserver")
     while True:
         try:
@@ -21,14 +21,14 @@ def children(of="self"):
                 if not own.search(Path("/proc", pid, "cmdline").read_bytes())
             }
         except (FileNotFoundError, ProcessLookupError):
-            # A thread or a child ended meanwhile; a thread's children went to another.
+            # A thread or child ended meanwhile; a thread's children go to another.
             continue
 
 
 def kill_children(name):
-    """Kill this process's children of that name, and return how many there were.
+    """Kill this process's children of that name, and return their number.
 
-    One that was started just now has its parent's name for a moment.
+    It waits for the first, as a new child still has its parent's name.
     """
     deadline = time.monotonic() + 10
     named = []
@@ -43,27 +43,27 @@ def forked(child):
     """Run a function in a forked process, and wait for its end.
 
     Args:
-        child: what it does; it calls what it is given to say that it has come so far.
+        child: a function of a callback, which it calls to count its steps.
 
     Returns:
-        How often it did, and the status that the process ended with.
+        The number of calls of the callback, and the status of the process.
     """
     incoming, outgoing = os.pipe()
-    # Whatever becomes of `os.write` in the process.
-    tell = functools.partial(os.write, outgoing, b".")
+    # This keeps the original `os.write` when the child patches it.
+    count = functools.partial(os.write, outgoing, b".")
     process = os.fork()
     if process == 0:
         try:
-            child(tell)
+            child(count)
         finally:
             os._exit(1)
     os.close(outgoing)
-    with os.fdopen(incoming, "rb") as said:
-        far = len(said.read())
+    with os.fdopen(incoming, "rb") as pipe:
+        calls = len(pipe.read())
     _, status = os.waitpid(process, 0)
-    return far, status
+    return calls, status
 
 
 def kill_self(*_):
-    """End this process as the kernel does where memory is short."""
+    """Kill this process as the kernel does when memory is short."""
     os.kill(os.getpid(), signal.SIGKILL)

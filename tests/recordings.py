@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what a monitor wrote, with nothing of mjrec."""
+"""Reads a monitor's directory, and edits its journal."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ from mjrec.formats.spans import recordings_in_flight
 
 
 def in_flight(directory):
-    """Return what recordings that only logs have are called, sorted by name."""
+    """Return the paths of recordings that are only in logs, sorted by name."""
     return sorted(each.path for each in recordings_in_flight(directory))
 
 
@@ -26,21 +26,21 @@ def stats_of(directory):
 
 
 def journal_of(directory):
-    """Return the complete episodes that the journal has."""
+    """Return the journal's complete episodes."""
     return [line for line in _lines(directory) if "episode_id" in line]
 
 
 def events_of(directory, kind):
-    """Return the facts of the journal's other events of a kind."""
+    """Return the facts of the journal's events of a kind."""
     return [line[kind] for line in _lines(directory) if kind in line]
 
 
 def edit_journal(directory, index, **values):
-    """Change what the journal says of a complete episode."""
+    """Change values of a complete episode in the journal."""
     [path] = directory.glob("openaigym.episodes.*")
     lines = path.read_text().splitlines()
-    of_episodes = [n for n, line in enumerate(lines) if '"episode_id"' in line[:14]]
-    number = of_episodes[index]
+    episodes = [n for n, line in enumerate(lines) if '"episode_id"' in line[:14]]
+    number = episodes[index]
     lines[number] = json.dumps({**json.loads(lines[number]), **values})
     path.write_text("".join(f"{line}\n" for line in lines))
 
@@ -60,19 +60,19 @@ def frames_in(directory, episode):
 
 
 def frames_of(path):
-    """Decode a video, with another decoder than the one that wrote it."""
+    """Decode a video with PyAV, which mjrec does not use."""
     with av.open(str(path)) as container:
         return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
 def hashes_at(path):
-    """Return the SHA-256 of each frame, as a framehash file says them."""
+    """Return the SHA-256 of each frame from a framehash file."""
     lines = [line for line in path.read_text().splitlines() if line[:1] != "#"]
     return [line.rpartition(",")[2].strip() for line in lines]
 
 
 def videos_in(directory):
-    """Return the numbers of the episodes that have a video."""
+    """Return the numbers of episodes with a video."""
     names = (path.name for path in directory.glob("openaigym.*.mp4"))
     return sorted(int(re.findall(r"video(\d{6})\.mp4", name)[0]) for name in names)
 
@@ -83,17 +83,17 @@ def _json(pattern, directory):
 
 
 def add_facts(path, facts):
-    """Add to the facts of a recording in flight, as its monitor does."""
-    say(path, "note", {"name": path.name.removesuffix(".h5"), "facts": facts})
+    """Add facts to a recording in flight, as its monitor does."""
+    _add_event(path, "note", {"name": path.name.removesuffix(".h5"), "facts": facts})
 
 
 def drop(path):
-    """Give up a recording in flight, as its monitor does."""
-    say(path, "drop", path.name.removesuffix(".h5"))
+    """Drop a recording in flight, as its monitor does."""
+    _add_event(path, "drop", path.name.removesuffix(".h5"))
 
 
-def say(path, kind, facts):
-    """Add an event to the journal of the monitor that a recording is of."""
+def _add_event(path, kind, facts):
+    """Add an event to the journal of a recording's monitor."""
     journal = path.with_name(journal_name(infix_of(path.name) or ""))
     with contextlib.closing(JournalWriter(journal)) as writer:
         writer.note(kind, facts)

@@ -79,7 +79,7 @@ def video(directory):
 
 
 def killed(directory):
-    """Record an episode without an end; return its log."""
+    """Record an episode that was cut by a kill; return its log."""
     dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
     logs = new_logs(directory, tail_bytes=1)
     span = logs.begin(trajectory_prefix(INFIX, 0), {}, dtype)
@@ -101,7 +101,7 @@ def killed_with(part):
     return lambda directory: killed(directory).with_suffix(part)
 
 
-# The reader of `hostile_reading` and the builder of each kind.
+# The reader of `hostile_reading` and the builder of each kind of file.
 FILES = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings are finished beside a simulation, by a process of its own."""
+"""The background process, which finishes recordings beside a simulation."""
 
 import functools
 import os
@@ -22,7 +22,7 @@ from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
 
-# A program around it, with the directory at argv[1].
+# Submits all recordings of the directory in argv[1], forks, and waits.
 PROGRAM = """
 import os, pathlib, sys, threading, time
 from mjrec.formats.spans import recordings_in_flight
@@ -43,7 +43,7 @@ time.sleep(60)
 
 @pytest.fixture
 def recorded(tmp_path, play):
-    """Two short episodes of a simulation, as yet without videos."""
+    """Two short episodes, still without videos."""
     small = {"width": 40, "height": 32, "max_episode_steps": 3}
     env = gymnasium.make("InvertedPendulum-v5", **small)
     directory = tmp_path / "recorded"
@@ -55,7 +55,7 @@ def recorded(tmp_path, play):
 
 @pytest.fixture
 def start(tmp_path):
-    """Make backgrounds that are given recordings, and are stopped at the end."""
+    """A function that starts backgrounds with recordings; they stop at the end."""
     made = []
 
     def make(directory=tmp_path, *logs, workers=1):
@@ -70,13 +70,13 @@ def start(tmp_path):
 
 
 @pytest.fixture
-def others():
-    """The processes that were there before."""
+def before():
+    """The child processes from before the test."""
     return children()
 
 
-def patched(tmp_path, monkeypatch, code):
-    """Let the process run other code first."""
+def patch_child(tmp_path, monkeypatch, code):
+    """Let the background process run this code first."""
     lines = "".join(f"    {line}\n" for line in code.splitlines())
     guarded = f"import sys\nif sys.argv[0] == '-m':\n{lines}"
     (tmp_path / "sitecustomize.py").write_text(guarded)
@@ -84,7 +84,6 @@ def patched(tmp_path, monkeypatch, code):
 
 
 def is_finished(log):
-    """Return whether it is there, and its rows are not."""
     return log.exists() and find_recording(log) is None
 
 
@@ -96,14 +95,11 @@ def has_ended(pid):
     return stat.rpartition(")")[2].split()[0] == "Z"
 
 
-# What it does
-
-
-def test_one_process_does_all(tmp_path, others, start, monkeypatch):
-    """Also what comes after a wait; without anything to do there is none."""
+def test_one_process_finishes_all_recordings(tmp_path, before, start, monkeypatch):
+    """It stays for those after `wait`; without recordings it does not start."""
     background = start()
     background.wait()
-    assert children() == others
+    assert children() == before
     for round_ in range(2):
         logs = [write_log(tmp_path, 10 * round_ + k, video=None) for k in range(3)]
         for log in logs:
@@ -111,19 +107,19 @@ def test_one_process_does_all(tmp_path, others, start, monkeypatch):
         background.wait()
         assert all(map(is_finished, logs))
         assert (list(background.waiting), background.failures) == ([], {})
-        [process] = children() - others
-        # Ctrl-C in the terminal does not reach it, and it gives way to others.
+        [process] = children() - before
+        # Ctrl-C in the terminal does not reach it, and its priority is low.
         assert os.getsid(process) == process
         assert os.getpriority(os.PRIO_PROCESS, process) == 10
     background.stop()
-    assert children() == others
+    assert children() == before
 
 
-def test_submitting_never_waits(others, tmp_path, start):
-    """Not even while nobody reads, with more names than a pipe holds."""
+def test_submitting_never_waits(before, tmp_path, start):
+    """The process is stopped here, and the names fill more than a pipe."""
     log = write_log(tmp_path, video=None)
     background = start(tmp_path, log)
-    [process] = children() - others
+    [process] = children() - before
     os.kill(process, signal.SIGSTOP)
     for number in range(1, 3000):
         background.submit(tmp_path / f"{log.stem[:-6]}{number:06d}.h5")
@@ -133,8 +129,8 @@ def test_submitting_never_waits(others, tmp_path, start):
     assert is_finished(log)
 
 
-def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
-    """It is compressed beside the simulation; once nobody writes, it is an error."""
+def test_a_recording_waits_until_its_model_is_written(recorded, start):
+    """After `wait`, a missing model is a failure."""
     [model] = recorded.glob("*.mjb.gz")
     hidden = model.rename(model.with_name("hidden"))
     first, second = in_flight(recorded)
@@ -152,11 +148,11 @@ def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     assert len(list(recorded.glob("*.mp4"))) == 1
 
 
-# How it ends
+# Ends
 
 
-def test_stopping_leaves_what_is_not_done(recorded, others, start, stuck_encoder):
-    """At once, in the midst of a video; no process and no temporary file stays."""
+def test_stopping_keeps_unfinished_recordings(recorded, before, start, stuck_encoder):
+    """It takes effect within a video and leaves no process or temporary file."""
     logs = in_flight(recorded)
     background = start(recorded, *logs)
     wait_until(stuck_encoder.exists)
@@ -164,7 +160,7 @@ def test_stopping_leaves_what_is_not_done(recorded, others, start, stuck_encoder
     background.stop()
     assert time.monotonic() - began < 3
     background.stop()
-    assert children() == others
+    assert children() == before
     assert not list(recorded.glob("*.meta.json"))
     assert not list(recorded.glob(".*"))
     late = write_log(recorded, video=None)
@@ -176,16 +172,13 @@ def test_stopping_leaves_what_is_not_done(recorded, others, start, stuck_encoder
 
 
 @parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
-def test_another_process_goes_on_for_a_dead_one(
-    others, signum, recorded, start, caplog
-):
-    """Nothing is missing, nothing is left of the first one, and it is told how it died.
+def test_a_dead_process_is_replaced(before, signum, recorded, start, caplog):
+    """All videos are complete, and the log has the signal.
 
-    It dies once in the midst of a video and is gone when it is waited for, and once
-    before anything has begun.
+    SIGKILL arrives during a video, SIGSEGV before any work.
     """
     background = start(recorded, *in_flight(recorded))
-    [process] = children() - others
+    [process] = children() - before
     if signum == signal.SIGKILL:
         wait_until(lambda: list(recorded.glob(".*.mp4.*.part")))
     os.kill(process, signum)
@@ -197,15 +190,15 @@ def test_another_process_goes_on_for_a_dead_one(
     assert signum.name in caplog.text
     background.stop()
     assert not list(recorded.glob(".*"))
-    assert children() == others
+    assert children() == before
 
 
-def test_the_second_death_is_one_clear_failure(others, tmp_path, start, caplog):
-    """It is told how they died; nothing waits for ever, and all stays pending."""
+def test_after_the_second_death_all_recordings_fail(before, tmp_path, start, caplog):
+    """The failure has the signal, and no process starts again."""
     logs = [write_log(tmp_path, k, model={"mjb": "none"}) for k in range(3)]
     background = start(tmp_path, *logs[:2])
     for _ in range(2):
-        [process] = children() - others
+        [process] = children() - before
         os.kill(process, signal.SIGKILL)
         wait_until(functools.partial(has_ended, process))
         background.submit(logs[2])
@@ -216,7 +209,7 @@ def test_the_second_death_is_one_clear_failure(others, tmp_path, start, caplog):
     background.submit(write_log(tmp_path, 3))
     background.wait()
     assert len(background.failures) == 4
-    assert children() == others
+    assert children() == before
 
 
 HANGING = """
@@ -241,23 +234,28 @@ f.finish_trajectory = slowly
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("hangs", [True, False])
-def test_one_that_hangs_is_ended(hangs, others, tmp_path, start, caplog, monkeypatch):
-    """With its children; the log has its threads' stacks, and another one tries.
-
-    One that is at work does not hang, however long it takes for one thing.
-    """
-    pids = tmp_path / "pids"
-    code = HANGING.format(pids=str(pids)) if hangs else SLOW
-    patched(tmp_path, monkeypatch, code)
+def test_a_process_at_work_does_not_hang(tmp_path, start, monkeypatch):
+    """One step may take several times the timeout."""
+    patch_child(tmp_path, monkeypatch, SLOW)
     monkeypatch.setenv("MJREC_TIMEOUT", "0.7")
     log = write_log(tmp_path, video=None)
     background = start(tmp_path, log)
     background.wait()
-    if not hangs:
-        assert background.failures == {}
-        assert is_finished(log)
-        return
+    assert background.failures == {}
+    assert is_finished(log)
+
+
+@pytest.mark.thorough
+def test_a_process_that_hangs_is_killed_with_its_children(
+    before, tmp_path, start, caplog, monkeypatch
+):
+    """The log has its threads' stacks, and another process tries."""
+    pids = tmp_path / "pids"
+    patch_child(tmp_path, monkeypatch, HANGING.format(pids=str(pids)))
+    monkeypatch.setenv("MJREC_TIMEOUT", "0.7")
+    log = write_log(tmp_path, video=None)
+    background = start(tmp_path, log)
+    background.wait()
     assert "hung for 2.1 seconds" in background.failures[log.name]
     assert "in wait_for_a_disk_that_does_not_answer" in caplog.text
     assert caplog.text.count("Its threads' stacks") == 2
@@ -265,17 +263,15 @@ def test_one_that_hangs_is_ended(hangs, others, tmp_path, start, caplog, monkeyp
     started = [int(pid) for pid in pids.read_text().split()]
     assert len(started) == 2
     wait_until(lambda: all(map(has_ended, started)))
-    assert children() == others
+    assert children() == before
 
 
-def test_workers_are_forks_and_one_that_dies_is_replaced(
-    recorded, others, start, caplog
-):
-    """What they import is imported once; they end with the process, however it ends."""
+def test_workers_are_forks_and_a_dead_one_is_replaced(recorded, before, start, caplog):
+    """Forks share imports; they end even when the process is killed."""
     background = start(recorded, workers=2)
     for victim in ("a worker", "the process"):
         background.expect()
-        [process] = children() - others
+        [process] = children() - before
         wait_until(lambda: len(children(process)) == 2)  # noqa: B023  called at once
         commands = {
             Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -296,13 +292,11 @@ def test_workers_are_forks_and_one_that_dies_is_replaced(
     assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
 
 
-def test_a_worker_beside_a_simulation_draws_with_one_thread(
-    recorded, others, start, monkeypatch
-):
-    """Mesa's rasterizer would start as many as there are CPUs, also in the only one."""
+def test_the_only_worker_renders_with_one_thread(recorded, before, start, monkeypatch):
+    """Mesa's rasterizer would start a thread for each CPU."""
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     background = start(recorded, in_flight(recorded)[0], workers=1)
-    [process] = children() - others
+    [process] = children() - before
     background.wait()
     [worker] = children(process)
     environ = Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
@@ -311,13 +305,10 @@ def test_a_worker_beside_a_simulation_draws_with_one_thread(
     assert not [name for name in names if name.startswith("llvmpipe")]
 
 
-# What it leaves alone
+def test_the_process_ends_when_its_parent_is_killed(tmp_path):
+    """The parent has forked a child that lives on.
 
-
-def test_it_ends_with_its_parent(tmp_path):
-    """However that ends, and though it has forked a child that lives on.
-
-    The parent has no thread for it, and no library that draws or writes HDF5.
+    The parent needs no thread for it, and no library that renders or writes HDF5.
     """
     log = write_log(tmp_path, model={"mjb": "none"})
     with subprocess.Popen(
@@ -329,7 +320,7 @@ def test_it_ends_with_its_parent(tmp_path):
         program.kill()
         program.wait()
         wait_until(lambda: has_ended(process))
-        # The child, which has nothing to do with it.
+        # Kill the forked child.
         os.killpg(program.pid, signal.SIGKILL)
     with open_trajectory(log) as reader:
         assert reader.step_count == 4

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks at a toy size: what they give, not how fast anything is."""
+"""The benchmarks at a toy size: their results, not their speed."""
 
-import importlib
 import importlib.util
 import json
 import subprocess
@@ -25,13 +24,13 @@ def result(*samples, **others):
     return Result(subject="s", variant="v", unit="s", samples=samples, **others)
 
 
-def test_comparison_is_that_of_the_medians():
-    """Its range is that of the rounds; memory is subtracted; a bound itself is kept."""
+def test_results_compare_medians_and_check_promises():
+    """Quartiles are those of the rounds; memory is subtracted, and bounds inclusive."""
     reference = Reference("bare", (2.0, 4.0, 100.0))
     compared = result(1.0, 3.0, 90.0, reference=reference, promise=at_least(0.8))
     assert compared.compared == 3.0 / 4.0
     assert compared.compared_quartiles == pytest.approx((0.625, 0.825))
-    # The promise is about the comparison, and not about the number itself.
+    # The promise concerns the comparison, not the number.
     assert compared.is_kept is False
     for promise, kept, broken in ((at_least(0.8), 0.8, 0.79), (at_most(64), 64.0, 65)):
         assert result(kept, promise=promise).is_kept is True
@@ -40,8 +39,8 @@ def test_comparison_is_that_of_the_medians():
     assert result(90.0, reference=difference).compared == 20.0
 
 
-def test_what_was_not_measured_keeps_and_breaks_nothing():
-    """It stands in the table, and says why."""
+def test_a_missing_measurement_is_in_the_table_with_its_reason():
+    """It neither keeps nor breaks its promise."""
     missing = result(promise=at_least(1), note="moviepy is not installed")
     assert missing.is_kept is None
     assert json.dumps(missing.as_json(), allow_nan=False)
@@ -51,8 +50,7 @@ def test_what_was_not_measured_keeps_and_breaks_nothing():
     assert "moviepy is not installed" in captured.get()
 
 
-def test_failing_child_says_what_it_printed():
-    """An environment that there is not."""
+def test_the_error_of_a_failed_child_has_its_output():
     setup = {"env_id": "NoSuchThing-v5"}
     with pytest.raises(ChildFailed, match="NoSuchThing"):
         call(stepping.run_episodes, setup=setup, steps=1)
@@ -66,8 +64,7 @@ RECORDERS = {"recorders": ("bare", "workers=0")}
 EPISODES = {"episodes": 2, "short": 3, "long_episodes": 1, "long": 5}
 ONE_VIDEO = {"videos": 1, "frames": 3, "size": 32, "workers": 1}
 
-# How little is measured, how many numbers there are or what each is called, and what is
-# promised of them.
+# Settings, the number or names of the results, and their promises.
 MEASURED = {
     "engines": ({"engines": ("local",), "workers": (2,), "jobs": 20}, 3, ("≤ 5",)),
     "starting": ({}, ["mjrec --help", "mjrec list"], ("≤ 0.4", "≤ 0.5")),
@@ -109,21 +106,19 @@ MEASURED = {
 
 
 @parametrize("name", MEASURED)
-def test_each_measurement_gives_its_numbers(name):
-    """As many as it is to, beside what it promises."""
+def test_each_measurement_gives_its_results_and_promises(name):
     if name == "evaluating":
         pytest.importorskip("dm_control")
-    settings, given, promises = MEASURED[name]
+    settings, expected, promises = MEASURED[name]
     module = importlib.import_module(f"benchmarks.{name}")
     results = module.measure(module.Settings(rounds=1, **settings), lambda words: None)
     variants = [r.variant for r in results]
-    assert given in (None, len(variants), variants)
+    assert expected in (None, len(variants), variants)
     assert all(r.median > 0 for r in results if r.samples)
     assert {*promises} <= {str(r.promise) for r in results if r.promise}
 
 
-def test_command_names_what_can_be_measured():
-    """An unknown name is refused before anything is measured."""
+def test_the_command_lists_measurements_for_an_unknown_name():
     command = [sys.executable, "-m", "benchmarks", "--only", "speed"]
     root = Path(__file__).parents[1]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)

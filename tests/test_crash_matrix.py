@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""However a recording process ends, at whatever moment: what was complete is there.
+"""Complete episodes survive any end of the recording process at any moment.
 
-Each case ends a child process in one way at a random moment (seeded), and then loads,
-recovers and renders what it left. The default run tries one moment of a few of them.
+Each case ends a child process in one way at a random moment (seeded), then loads,
+recovers and renders its directory. The default run tries one moment of a few ways.
 """
 
 import itertools
@@ -22,11 +22,11 @@ import mjrec
 from mjrec.rendering.finish import finish
 
 MOMENTS = 20
-# From the moment in which the child has begun to record.
+# The seconds start when the child begins to record.
 LONGEST = 0.8
 
-# Records one short episode after the other, and says which are over. What it is told
-# to do to itself comes at any moment, between any two instructions.
+# Records short episodes and prints each that is over. Its own exception or exit comes
+# between any two instructions.
 PROGRAM = """
 import json, os, signal, sys, threading
 import gymnasium, numpy, mjrec
@@ -41,7 +41,7 @@ env = mjrec.Monitor(env, directory, lambda episode: episode % 5 == 0, render=ren
                     workers=1, trajectory_callable=True, quality="full")
 
 class Crash(Exception):
-    # Not a RuntimeError, which Python's own threading.Condition would swallow.
+    # Python's threading.Condition would swallow a RuntimeError.
     pass
 
 def crash(*_):
@@ -61,7 +61,7 @@ while True:
         _, reward, terminated, truncated, _ = env.step(generator.uniform(-0.2, 0.2, 1))
         rewards.append(float(reward))
         done = terminated or truncated
-    # What is said is true: the line is there before anybody else can read it.
+    # This write is unbuffered, so that a kill loses no printed line.
     os.write(1, (json.dumps([episode, rewards]) + "\\n").encode())
     env.reset()
 """
@@ -77,12 +77,12 @@ WAYS = {
 
 
 def crash(directory, render, way, delay):
-    """Record until the process ends in that way; return the rewards that it told."""
+    """Record until the process ends in that way; return the rewards it printed."""
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(directory), render, way, str(delay)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        # Or what follows the first line could be read with it, and be lost.
+        # With a buffer, `readline` could take more than the first line.
         bufsize=0,
         start_new_session=True,
     ) as process:
@@ -96,7 +96,7 @@ def crash(directory, render, way, delay):
 
 
 def check_statistics(directory, over):
-    """Every episode that was over is counted; at most one more, just not said."""
+    """Check that each printed episode is counted, and at most one more."""
     results = mjrec.load_results(directory)
     lengths = [] if results is None else results["episode_lengths"]
     assert len(over) <= len(lengths) <= len(over) + 1
@@ -106,7 +106,7 @@ def check_statistics(directory, over):
 
 
 def check_episodes(directory, over):
-    """Trajectories bit for bit; of scheduled ones a video with every frame."""
+    """Check that trajectories are exact, and scheduled videos have every frame."""
     for episode, rewards in over.items():
         [path] = directory.glob(f"*.episode{episode:06d}.h5")
         trajectory = mjrec.load_trajectory(path)
@@ -118,14 +118,13 @@ def check_episodes(directory, over):
             assert metadata_of(directory, episode)["complete"] is True
 
 
-def check_the_last(directory, number, reason):
-    """The episode that was running says how long it is and why it is not whole."""
+def check_last_episode(directory, number, reason):
+    """Check that the running episode has its length and the reason of its end."""
     trajectories = map(mjrec.load_trajectory, directory.glob(f"*{number:06d}.h5"))
     facts = [{**each.facts, "rows": len(each.rewards)} for each in trajectories]
     metadata = directory.glob(f"*{number:06d}.meta.json")
     facts += [json.loads(path.read_text()) for path in metadata]
-    # Both come from a signal's handler. If it runs while an episode ends, it leaves
-    # what a kill leaves.
+    # If a signal handler runs while an episode ends, it leaves what a kill leaves.
     by_handler = reason in ("interrupt", "exception")
     for each in facts:
         assert each["complete"] or each["reason"] in (reason, *["killed"] * by_handler)
@@ -133,16 +132,16 @@ def check_the_last(directory, number, reason):
 
 
 def render_all(directory):
-    """Render what is pending; False while the dead process's renderer holds some.
+    """Render pending videos; return False while the dead process's renderer has some.
 
-    It ends when it notices that its parent is gone, and until then is left alone.
+    The renderer ends when it notices that its parent is gone.
     """
     found = list(finish(directory, workers=1))
     assert not any(each.failures for each in found)
     return not any(each.elsewhere for each in found)
 
 
-# Takes more than five seconds: a process is killed, and all of its videos are drawn.
+# Takes more than five seconds: all videos of the dead process are rendered.
 @pytest.mark.usefixtures("default_signals")
 @parametrize(
     ("way", "render", "moment"),
@@ -150,18 +149,19 @@ def render_all(directory):
     default=[(*case, 0) for case in DEFAULT],
     part=pytest.mark.crashes,
 )
-def test_what_was_complete_is_there(way, render, moment, tmp_path):
-    """Loaded, recovered, rendered and compared; no hidden file or log is left."""
+def test_complete_episodes_survive_and_no_temporary_file_is_left(
+    way, render, moment, tmp_path
+):
     delay = random.Random(f"{way} {render} {moment}").uniform(0, LONGEST)
     over = crash(tmp_path, render, way, delay)
     check_statistics(tmp_path, over)
-    # A child between fork and exec may hold its parent's lock for a moment.
+    # A child between fork and exec may still hold its parent's lock.
     wait_until(lambda: not mjrec.recover(tmp_path).open_monitors, seconds=60)
     assert not mjrec.recover(tmp_path), "something was left to recover"
     wait_until(lambda: render_all(tmp_path), seconds=60)
     check_statistics(tmp_path, over)
     check_episodes(tmp_path, over)
-    check_the_last(tmp_path, len(over), WAYS[way][0])
+    check_last_episode(tmp_path, len(over), WAYS[way][0])
     left = [*tmp_path.glob(".*"), *tmp_path.glob("openaigym.states.*")]
     assert [path.name for path in left if path.suffix != ".lock"] == []
     for path in tmp_path.glob("*.json"):

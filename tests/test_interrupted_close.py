@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `close()` that Ctrl-C interrupts leaves what SIGKILL leaves: nothing is lost."""
+"""A `close` interrupted by Ctrl-C loses nothing, like one interrupted by SIGKILL."""
 
 import contextlib
 import gc
@@ -28,7 +28,7 @@ _ENTRANCE = ("close", "close_here", "call_all", "_leaving_if_interrupted")
 
 
 def record(directory, render):
-    """Record two episodes, and the first steps of a third."""
+    """Record two episodes and the first steps of a third."""
     size = {"width": 32, "height": 32, "max_episode_steps": 4}
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", **size)
     monitor = mjrec.Monitor(env, directory, lambda _: True, render=render, workers=0)
@@ -40,20 +40,20 @@ def record(directory, render):
 
 
 def close(monitor, last=math.inf):
-    """Close it, press Ctrl-C behind so many calls and returns, and return their count.
+    """Close the monitor; interrupt it after `last` calls and returns in mjrec.
 
-    They are those of mjrec's functions.
+    Return the number of calls and returns.
     """
     count = 0
 
     def interrupt(frame, event, _):
         nonlocal count
         path = Path(frame.f_code.co_filename)
-        # While HDF5 writes, signals wait.
+        # Signals wait while HDF5 writes.
         is_ours = "mjrec" in path.parts and path.stem != "trajectory_hdf5"
         if event in ("call", "return") and is_ours:
             count += 1
-            # At its very entrance closing has not begun: the next call does all of it.
+            # At the entrance closing has not begun; the next `close` does all of it.
             if count >= last and frame.f_code.co_name not in _ENTRANCE:
                 raise KeyboardInterrupt
 
@@ -67,8 +67,8 @@ def close(monitor, last=math.inf):
     return count
 
 
-# Takes more than five seconds: a run, its recovery and its videos for each moment. A
-# file that was opened in just that moment is closed by the garbage collection.
+# Takes more than five seconds: it records, recovers and renders a run. Garbage
+# collection closes a file that was opened at the moment of Ctrl-C.
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @parametrize(
     ("render", "moment"),
@@ -76,18 +76,19 @@ def close(monitor, last=math.inf):
     default=[("deferred", 7), ("deferred", 15), ("live", 5), ("live", 15)],
     part=pytest.mark.crashes,
 )
-def test_finish_completes_what_ctrl_c_has_cut_short(render, moment, tmp_path):
-    """All episodes are there; the monitor is closed and lets go of its files."""
+def test_an_interrupted_close_releases_all_files_and_loses_no_episode(
+    render, moment, tmp_path, names
+):
     whole = close(record(tmp_path / "whole", render))
     directory = tmp_path / "cut"
     monitor = record(directory, render)
     last = whole * (moment + 0.5) // MOMENTS
-    # Python takes a profiler that has raised for a broken one.
+    # Python removes a profiler that raises, so the count ends at Ctrl-C.
     assert close(monitor, last) >= last
-    # Closed: it does nothing more, and another process may put things in order.
-    before = sorted(directory.iterdir())
+    # A second `close` does nothing, and another process may recover the directory.
+    before = names(directory)
     monitor.close()
-    assert sorted(directory.iterdir()) == before
+    assert names(directory) == before
     wait_until(lambda: not mjrec.recover(directory).open_monitors)
     wait_until(lambda: not mjrec.recover(directory).failures)
     assert not any(each.failures for each in finish(directory, workers=1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A thousand recorded episodes leave the process as it was."""
+"""A thousand recorded episodes leak no memory, files, threads or processes."""
 
 import gc
 import os
@@ -16,21 +16,21 @@ from waiting import wait_until
 from mjrec import Monitor, load_results
 
 EPISODES = 1000
-# Until all code is loaded, and all memory that is used again has been used.
+# Meanwhile code is loaded and reusable memory allocated.
 WARM_UP = 200
-# Of statistics, which grow by some hundred bytes an episode, and of Python's arenas.
+# Statistics take some hundred bytes an episode, and Python's arenas vary.
 MOST_GROWTH = 4 << 20
 
 
 def memory():
-    """Return how many bytes of this process are resident."""
+    """Return the resident bytes of this process."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def held():
-    """Return what this process holds: files, and names of threads."""
+    """Return this process's open files and the names of its threads."""
     gc.collect()
     return {
         "files": sorted(_file(fd) for fd in Path("/proc/self/fd").iterdir()),
@@ -40,10 +40,10 @@ def held():
 
 def _file(descriptor):
     try:
-        # Pipes and sockets have numbers of their own, and so has each log.
+        # Pipes, sockets and logs have numbers that differ each time.
         name = str(descriptor.readlink()).split(":")[0]
         return re.sub(r"\.\d{6}\.(log|looks|tail)$", "", name)
-    except FileNotFoundError:  # of the listing itself
+    except FileNotFoundError:  # the descriptor of the listing itself
         return ""
 
 
@@ -54,20 +54,19 @@ def run(monitor, episodes):
             monitor.step(monitor.action_space.sample() * 0)
 
 
-# Takes more than five seconds: a thousand episodes, so that what grows is seen.
+# Takes more than five seconds: growth shows after a thousand episodes.
 @pytest.mark.usefixtures("no_process_is_left")
 @parametrize("workers", [1, 0])
-def test_recorded_episodes_leave_nothing(workers, tmp_path):
-    """Memory, files, threads and processes; each episode with its trajectory."""
+def test_deferred_episodes_leak_nothing(workers, tmp_path):
     env = gymnasium.make(
         "InvertedPendulum-v5", width=32, height=32, max_episode_steps=3
     )
     before, others = held(), children()
-    # Some videos, so that there are workers and encoders to be left behind.
+    # Some episodes have videos, so that workers and encoders could leak.
     options = {"trajectory_callable": True, "workers": workers}
     monitor = Monitor(env, tmp_path, lambda episode: episode % 200 == 0, **options)
     run(monitor, WARM_UP)
-    # What looks for the run's provenance has ended then; what renders stays.
+    # The process that collects provenance has ended then; the renderer stays.
     wait_until(lambda: len(children() - others) <= workers)
     warm, used = held(), memory()
     run(monitor, EPISODES - WARM_UP)
@@ -80,8 +79,7 @@ def test_recorded_episodes_leave_nothing(workers, tmp_path):
     assert len(list(tmp_path.glob("*.mp4"))) == (EPISODES // 200 if workers else 0)
 
 
-def test_episodes_that_are_dropped_hold_no_tail(tmp_path):
-    """Also before the garbage collector runs."""
+def test_dropped_episodes_release_their_tails_without_garbage_collection(tmp_path):
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     monitor = Monitor(env, tmp_path, keep="worst:3", workers=0)
     gc.disable()
@@ -94,11 +92,10 @@ def test_episodes_that_are_dropped_hold_no_tail(tmp_path):
         monitor.close(wait=False)
 
 
-# Takes more than five seconds: an encoder for each episode.
+# Takes more than five seconds: each episode has an encoder.
 @pytest.mark.usefixtures("no_process_is_left")
 @parametrize("count", [60, EPISODES])
-def test_live_episodes_leave_nothing(count, tmp_path, make_corridor):
-    """Each has an encoder of its own."""
+def test_live_episodes_leak_nothing(count, tmp_path, make_corridor):
     before = held()
     monitor = Monitor(make_corridor(3, size=(16, 16)), tmp_path, lambda _: True)
     run(monitor, count // 3)

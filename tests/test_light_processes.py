@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes load no simulator, no OpenGL and no engine that they do not need."""
+"""Commands and modules import no simulator, OpenGL or engine unless needed."""
 
 import pytest
 from engine_runs import run_python
@@ -16,14 +16,14 @@ CASES = [
         "tasks_from(['gymnasium:mujoco'])",
         {*SIMULATORS, "gymnasium"},
     ),
-    # Importing mujoco settles its OpenGL backend.
+    # Importing mujoco fixes its OpenGL backend.
     (
         "import gymnasium\n"
         "from mjrec.environments.gymnasium_scenes import gymnasium_scenes\n"
         "assert gymnasium_scenes(gymnasium.make('CartPole-v1')).states is None",
         SIMULATORS,
     ),
-    # So that help is there at once, and a list nearly so.
+    # Help and lists must be fast.
     (
         "from mjrec.commands import main\nmain(['--help'])",
         {*SIMULATORS, "tyro", "rich", "numpy", "h5py"},
@@ -32,7 +32,7 @@ CASES = [
         "from mjrec.commands import main\nmain(['list', '.'])",
         {*SIMULATORS, "gymnasium", "h5py", "scipy", "imageio"},
     ),
-    # What hands out an evaluation; a policy's memory is the workers'.
+    # Only the workers of an evaluation load policies and simulators.
     pytest.param(
         "import pathlib, test_evaluating\ntest_evaluating.run(pathlib.Path('e'))",
         SIMULATORS,
@@ -42,11 +42,10 @@ CASES = [
 
 
 @pytest.mark.parametrize(("code", "unneeded"), CASES)
-def test_what_is_not_needed_is_not_loaded(code, unneeded, tmp_path, monkeypatch):
-    """Each in a process of its own."""
+def test_unneeded_modules_are_not_imported(code, unneeded, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    begin = (
+    report = (
         "import atexit, sys\natexit.register(lambda: print('loaded:', *sys.modules))"
     )
-    said = run_python("-c", f"{begin}\n{code}")
-    assert not unneeded & set(said.rpartition("loaded:")[2].split())
+    output = run_python("-c", f"{report}\n{code}")
+    assert not unneeded & set(output.rpartition("loaded:")[2].split())

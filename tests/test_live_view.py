@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live view: a read-only server of pages about a run that goes on."""
+"""The live view: a local, read-only server of pages about a running recording."""
 
 import base64
-import contextlib
 import json
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import urllib.error
 import urllib.request
 import zlib
@@ -17,6 +15,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 import gymnasium
 import numpy as np
 import pytest
+from browsers import data_of, served
 
 import mjrec
 from mjrec.commands import main
@@ -26,7 +25,7 @@ pytest.importorskip("viser")
 from mjrec.viewing.live import LiveView
 
 STEPS = 3
-# A weight on a thread falls beside a pulley.
+# A falling weight wraps its tendon around a pulley.
 WRAPPING = """
 <mujoco>
   <worldbody>
@@ -44,7 +43,7 @@ WRAPPING = """
 
 
 def begin(directory, **options):
-    """Return a monitor that has ended an episode."""
+    """Return a monitor that has recorded an episode."""
     directory.mkdir(parents=True, exist_ok=True)
     env = gymnasium.make("Hopper-v5", max_episode_steps=STEPS)
     env = mjrec.Monitor(env, directory, lambda _: True, workers=0, **options)
@@ -54,19 +53,8 @@ def begin(directory, **options):
     return env
 
 
-@contextlib.contextmanager
-def served(directory):
-    """Have a view of the run, answered by a thread."""
-    with LiveView(directory) as view:
-        thread = threading.Thread(target=view.serve)
-        thread.start()
-        yield view
-        view.close()
-        thread.join()
-
-
 def ask(view, page, **options):
-    """Return what the view says, in JSON."""
+    """Return the view's answer, which is JSON."""
     address = urlsplit(view.url)
     token = parse_qs(address.query)["token"][0]
     query = urlencode({"token": token, **options})
@@ -75,27 +63,27 @@ def ask(view, page, **options):
 
 
 def test_new_states_of_a_running_episode_are_served(tmp_path):
-    """A page gets the states that came since it last asked, and their rewards."""
+    """A page gets only the states since its last request, with their rewards."""
     with begin(tmp_path) as run, served(tmp_path) as view:
         run.reset(seed=1)
         run.step(np.zeros(3))
-        told = ask(view, "/episodes")
-        first, second = told["episodes"]
+        listed = ask(view, "/episodes")
+        first, second = listed["episodes"]
         assert (first["label"], first["length"]) == ("0", STEPS)
         assert (second["label"], second["running"]) == ("1", True)
-        assert len(told["returns"]) == told["count"] == 1
+        assert len(listed["returns"]) == listed["count"] == 1
         motion = ask(view, "/motion", episode=second["name"])
         assert (motion["steps"], motion["chunk"]["count"]) == (1, 2)
         assert motion["ending"] == ""
         _, reward, *_ = run.step(np.ones(3))
-        then = ask(view, "/motion", **{"episode": second["name"], "from": 2})
-        assert (then["steps"], then["chunk"]["count"]) == (2, 1)
-        data = zlib.decompress(base64.b64decode(then["chunk"]["data"]))
+        later = ask(view, "/motion", **{"episode": second["name"], "from": 2})
+        assert (later["steps"], later["chunk"]["count"]) == (2, 1)
+        data = zlib.decompress(base64.b64decode(later["chunk"]["data"]))
         assert np.frombuffer(data, "<f4")[2] == pytest.approx(reward, rel=1e-6)
 
 
-def test_an_evaluation_is_shown_as_one(tmp_path):
-    """Its episodes are named by their recordings, and the newest comes last."""
+def test_the_episodes_of_an_evaluation_are_listed_together(tmp_path):
+    """Labels tell their recordings apart, and the newest comes last."""
     for seed in (0, 1):
         place = tmp_path / f"Hopper-v5/seed-00{seed}"
         begin(place, uid=f"s{seed}", mode="evaluation").close()
@@ -108,8 +96,8 @@ def test_an_evaluation_is_shown_as_one(tmp_path):
     assert (listed["count"], motion["steps"]) == (2, STEPS)
 
 
-def test_episodes_of_other_sizes_are_other_scenes(tmp_path):
-    """A page shows the shapes of its episode, so it cannot show those of another."""
+def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path):
+    """A page has the shapes of one scene, so it must reload for another."""
     with begin(tmp_path) as run:
         for radius in (0.05, 0.2):
             run.unwrapped.model.geom_size[2, 0] = radius
@@ -124,30 +112,28 @@ def test_episodes_of_other_sizes_are_other_scenes(tmp_path):
     assert first == same != other
 
 
-def test_a_tendon_that_begins_to_wrap_gets_its_segments(tmp_path):
-    """The page is loaded again with them when they appear, and then kept."""
+def test_a_page_reloads_once_when_a_tendon_begins_to_wrap(tmp_path):
+    """Then it has the segments of the tendon."""
     (tmp_path / "model.xml").write_text(WRAPPING)
     options = ["--out", str(tmp_path / "run"), "--max-steps", "60", "--workers", "0"]
     assert main(["record", str(tmp_path / "model.xml"), *options]) == 0
 
     def page():
-        text = urllib.request.urlopen(view.url).read().decode()
-        data = json.loads(text.split('id="replay-data">')[1].split("</script>")[0])
+        data = data_of(urllib.request.urlopen(view.url).read().decode())
         segments = [name for name in data["nodes"] if name.startswith("/tendon/")]
         return data["scene"], len(segments)
 
     with served(tmp_path / "run") as view:
         [episode] = ask(view, "/episodes")["episodes"]
         first, one = page()
-        asked = [ask(view, "/motion", episode=episode["name"]) for _ in range(2)]
-        then, several = page()
+        motions = [ask(view, "/motion", episode=episode["name"]) for _ in range(2)]
+        second, several = page()
     assert one == 1 < several
-    assert first != then == asked[0]["scene"] == asked[1]["scene"]
+    assert first != second == motions[0]["scene"] == motions[1]["scene"]
 
 
-def test_an_episode_that_a_kill_cut_is_not_called_running(tmp_path):
-    """Only an open monitor has running episodes."""
-    # A copy of an open run is what a kill leaves: nobody holds its lock.
+def test_an_episode_cut_by_a_kill_is_not_running(tmp_path):
+    # A copy of an open run is what a kill leaves: no process holds its lock.
     with begin(tmp_path / "open") as run:
         run.reset(seed=1)
         run.step(np.zeros(3))
@@ -159,8 +145,8 @@ def test_an_episode_that_a_kill_cut_is_not_called_running(tmp_path):
     assert motion["ending"] == "End of the recording"
 
 
-def test_states_that_are_not_finite_are_left_out(tmp_path, monkeypatch):
-    """The page goes on after them, at the state that it is told."""
+def test_states_that_are_not_finite_are_skipped(tmp_path, monkeypatch):
+    """The answer names the state to request next."""
 
     def load(path, **options):
         trajectory = mjrec.load_trajectory(path, **options)
@@ -171,28 +157,25 @@ def test_states_that_are_not_finite_are_left_out(tmp_path, monkeypatch):
     begin(tmp_path).close()
     with served(tmp_path) as view:
         [episode] = ask(view, "/episodes")["episodes"]
-        told = ask(view, "/motion", episode=episode["name"])
-        assert (told["chunk"]["count"], told["next"]) == (STEPS, STEPS + 1)
-        then = {"episode": episode["name"], "from": STEPS}
-        assert "chunk" not in ask(view, "/motion", **then)
+        motion = ask(view, "/motion", episode=episode["name"])
+        assert (motion["chunk"]["count"], motion["next"]) == (STEPS, STEPS + 1)
+        rest = {"episode": episode["name"], "from": STEPS}
+        assert "chunk" not in ask(view, "/motion", **rest)
 
 
 @pytest.mark.parametrize("port", [-1, 65536])
-def test_a_port_that_does_not_exist_is_refused(port, tmp_path):
-    """The error says which ports there are."""
+def test_an_impossible_port_is_an_error(port, tmp_path):
     with pytest.raises(InvalidArgument, match="must be 0-65535"):
         LiveView(tmp_path, port=port)
 
 
-def test_a_view_that_never_served_can_be_closed(tmp_path):
-    """Nothing waits for it, however often."""
+def test_a_view_that_never_served_can_be_closed_repeatedly(tmp_path):
     with LiveView(tmp_path) as opened:
         opened.close()
     opened.close()
 
 
-def test_nothing_is_served_without_the_token(tmp_path):
-    """A page without the token, or of another name, is refused; nothing can be sent."""
+def test_requests_without_the_token_foreign_files_and_posts_are_refused(tmp_path):
     with served(tmp_path) as view:
         address = f"http://{urlsplit(view.url).netloc}"
         assert address.startswith("http://127.0.0.1:")
@@ -206,8 +189,8 @@ def test_nothing_is_served_without_the_token(tmp_path):
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_ends_the_command(tmp_path):
-    """It prints its address, answers, and leaves with status 0 and without an error."""
+def test_ctrl_c_ends_the_command_with_status_0(tmp_path):
+    """Before, it prints its URL and answers."""
     command = [sys.executable, "-m", "mjrec", "view", str(tmp_path)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, **pipes) as process:

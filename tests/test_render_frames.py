@@ -27,7 +27,7 @@ def ride(tmp_path_factory):
 
 @pytest.fixture
 def temporary(tmp_path, monkeypatch):
-    """Where temporary files go."""
+    """The directory of temporary files."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 
@@ -35,8 +35,7 @@ def temporary(tmp_path, monkeypatch):
 # Recorded episodes
 
 
-def test_a_recording_is_drawn_again(ride):
-    """From its path or what was loaded of it, as it was seen."""
+def test_a_path_or_trajectory_renders_the_recorded_frames(ride):
     before = children()
     assert np.array_equal(list(mjrec.render(str(ride.path))), ride.frames)
     loaded = mjrec.load_trajectory(ride.path)
@@ -49,15 +48,15 @@ MEMBERS = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -
 
 
 @pytest.mark.parametrize("kind", ["name", "members", "own"])
-def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
-    """Camera, size, quality and rate; visual options stay."""
+def test_arguments_override_the_recorded_view(ride, kind):
+    """Recorded visual options stay."""
     shown, option = mujoco.MjvCamera(), mujoco.MjvOption()
     for name, value in MEMBERS.items():
         setattr(shown, name, value)
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
     camera = {"name": "side", "members": MEMBERS, "own": shown}[kind]
     view = {"height": 30, "width": 50, "quality": "draft"}
-    # Ten a second are recorded: 0, 3, 6, and the last.
+    # Frames 0, 3, 6 and the last of those recorded at 10 Hz.
     drawn = list(mjrec.render(ride.path, camera=camera, max_fps=4, **view))
     assert [frame.shape for frame in drawn] == [(30, 50, 3)] * 4
     model, data = start()
@@ -67,24 +66,24 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
         assert np.array_equal(drawn[0], renderer.render(data))
 
 
-WRONG = [
-    ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
-    ({"camera": 1.5}, InvalidArgument, "camera must be a name"),
-    ({"camera": {"distance": "far"}}, InvalidArgument, "distance must be a number"),
-    ({"width": 0}, InvalidArgument, "width must be"),
-    ({"height": 20000}, InvalidArgument, "height must be"),
-    ({"camera": 7}, InvalidArgument, "Camera number 7 does not exist"),
-    ({"quality": "low"}, UnknownName, "no quality 'low'"),
-    ({"workers": 0}, InvalidArgument, "workers must be"),
-]
-
-
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
-    [*WRONG, ({"max_fps": 0}, InvalidArgument, "positive")],
+    [
+        ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
+        ({"camera": 1.5}, InvalidArgument, "camera must be a name"),
+        ({"camera": {"distance": "far"}}, InvalidArgument, "distance must be a number"),
+        ({"width": 0}, InvalidArgument, "width must be"),
+        ({"height": 20000}, InvalidArgument, "height must be"),
+        ({"camera": 7}, InvalidArgument, "Camera number 7 does not exist"),
+        ({"quality": "low"}, UnknownName, "no quality 'low'"),
+        ({"workers": 0}, InvalidArgument, "workers must be"),
+        ({"max_fps": 0}, InvalidArgument, "positive"),
+    ],
 )
-def test_arguments_are_checked_by_the_call(ride, temporary, arguments, kind, message):
-    """Not by the first frame; nothing is left running, and no file."""
+def test_the_call_checks_arguments_before_any_frame(
+    ride, temporary, arguments, kind, message
+):
+    """No process or file is left."""
     before = children()
     with pytest.raises(kind, match=message):
         mjrec.render(ride.path, **arguments)
@@ -96,8 +95,7 @@ def test_arguments_are_checked_by_the_call(ride, temporary, arguments, kind, mes
     assert list(temporary.iterdir()) == []
 
 
-def test_what_is_no_recording(tmp_path):
-    """One error each."""
+def test_anything_but_a_recording_with_snapshots_is_an_error(tmp_path):
     with pytest.raises(UnreadableFile, match=r"lost\.h5"):
         mjrec.render(tmp_path / "lost.h5")
     with pytest.raises(NoPictures, match="no snapshots"):
@@ -117,11 +115,10 @@ def test_what_is_no_recording(tmp_path):
         (0, 1, []),
     ],
 )
-def test_frames_are_chosen_by_rate(count, max_fps, chosen):
-    """Every n-th of those that were recorded, and the last."""
+def test_max_fps_chooses_every_nth_frame_and_the_last(count, max_fps, chosen):
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
-    # The process was killed before its second step.
+    # A process killed before its second step has recorded no rate.
     with pytest.raises(InvalidArgument, match="Omit max_fps"):
         chosen_frames(2, {}, 30)
     assert chosen_frames(1, {}, 30).indices == [0]
@@ -130,8 +127,7 @@ def test_frames_are_chosen_by_rate(count, max_fps, chosen):
 # Given states
 
 
-def test_states_are_drawn_as_mujoco_would(temporary):
-    """After `mj_forward`, over an infinite plane, by one worker and by three."""
+def test_states_render_as_with_mujoco_and_leave_no_file(temporary):
     model, data = start()
     states = np.empty((7, mujoco.mj_stateSize(model, int(SPEC))))
     shown = []
@@ -145,7 +141,7 @@ def test_states_are_drawn_as_mujoco_would(temporary):
     for workers in (1, 3):
         frames = mjrec.render_states(model, states, SPEC, workers=workers, **view)
         assert np.array_equal(list(frames), shown)
-    # Left early they leave no file, either.
+    # The generator is dropped before its end.
     frames = mjrec.render_states(model, states, SPEC, **view)
     next(frames)
     assert len(list(temporary.iterdir())) == 1

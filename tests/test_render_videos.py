@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec.render_videos`: pending or another way, here or by an engine's workers."""
+"""`mjrec.render_videos`: pending videos and other views, here or on an engine."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from parts import parametrize
-from recordings import frames_of
+from recordings import frames_of, manifest_of
 from trajectories_by_hand import (
     INFIX,
     write_finished,
@@ -46,11 +46,11 @@ VIDEO = "openaigym.video.0.7.video000000"
 DIED = "Its worker died on try 3 of 3: it was killed by SIGKILL."
 
 
-class Here(Executor):
-    """An executor whose one worker is this process, and dies at some of the jobs.
+class InlineExecutor(Executor):
+    """An executor whose only worker is this process.
 
     Args:
-        dies: a part of the keys of these jobs.
+        dies: the worker dies at jobs whose key contains this.
     """
 
     def __init__(self, dies=None):
@@ -72,17 +72,13 @@ class Here(Executor):
         return {"value": json.loads(json.dumps(self._worker(job["arguments"])))}
 
 
-@pytest.fixture(params=[None, Here], ids=["here", "engine"])
+@pytest.fixture(params=[None, InlineExecutor], ids=["here", "engine"])
 def engine(request):
-    """Where it is done."""
-    return request.param and Here()
+    return request.param and InlineExecutor()
 
 
-# What comes of each
-
-
-def test_pending_videos_are_made_once(tmp_path, painter, engine):
-    """The result says what became of each; a second call has nothing to do."""
+def test_pending_videos_are_rendered_once(tmp_path, painter, engine):
+    """The result lists videos, trajectories, failures and those of others."""
     write_finished(tmp_path, 0)
     write_finished(tmp_path, 1).write_bytes(b"torn")
     write_log(tmp_path, 2, video=None)
@@ -98,12 +94,15 @@ def test_pending_videos_are_made_once(tmp_path, painter, engine):
     assert rendered.elsewhere == ("openaigym.video.0.7.video000003.mp4",)
     assert not rendered.is_empty
     nothing = RenderedVideos(directory=tmp_path)
-    assert render_videos(tmp_path, episode=0, engine=engine and Here()) == nothing
+    assert (
+        render_videos(tmp_path, episode=0, engine=engine and InlineExecutor())
+        == nothing
+    )
 
 
 @parametrize("given", [None, "local", LocalEngine(2)])
-def test_every_engine_makes_the_same_files(tmp_path, play, given):
-    """By its name, or as it is given; and another view beside the original."""
+def test_every_engine_writes_the_same_files(tmp_path, play, given):
+    """Another view is written beside the original."""
     run, here = tmp_path / "run", tmp_path / "here"
     small = {"width": 40, "height": 32, "max_episode_steps": 3}
     env = gymnasium.make("InvertedPendulum-v5", **small)
@@ -125,13 +124,12 @@ def test_every_engine_makes_the_same_files(tmp_path, play, given):
 
 
 def contents(directory):
-    """Return the content of each file; HDF5 tells the time in its own."""
+    """Return the content of each file but HDF5, which contains times."""
     files = [path for path in directory.iterdir() if path.suffix != ".h5"]
     return {path.name: path.read_bytes() for path in files}
 
 
-def test_every_part_of_a_variant_is_in_its_name_and_reaches_workers(tmp_path):
-    """A part that was forgotten would be lost, or give two videos one name."""
+def test_every_field_of_a_variant_is_in_its_name_and_reaches_workers(tmp_path):
     views = [
         {"camera": "side"},
         {"camera": {"type": 0, "distance": 5.0}},
@@ -151,10 +149,7 @@ def test_every_part_of_a_variant_is_in_its_name_and_reaches_workers(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{}, {"fps": 30}], ids=["pending", "another way"])
-def test_where_nothing_can_be_drawn_one_try_is_enough(
-    tmp_path, painter, engine, options
-):
-    """And each video is told with the reason."""
+def test_without_opengl_one_try_fails_all_videos(tmp_path, painter, engine, options):
 
     def fail(*_):
         raise GLError("nothing renders here")
@@ -164,13 +159,13 @@ def test_where_nothing_can_be_drawn_one_try_is_enough(
     rendered = render_videos(tmp_path, engine=engine, **options)
     assert list(rendered.failures.values()) == ["nothing renders here"] * 3
     assert len(painter.asked) == 1
-    # Pending ones get their final form all the same.
+    # Pending ones are finished all the same.
     assert [log.exists() for log in logs] == [not options] * 3
 
 
 @pytest.mark.parametrize("options", [{}, {"max_fps": 10}])
-def test_ctrl_c_leaves_what_is_finished(tmp_path, painter, options):
-    """And nothing half-done; models were trusted during the call only."""
+def test_ctrl_c_keeps_finished_videos_and_ends_trust(tmp_path, painter, options):
+    """Models are trusted during the call only."""
     for number in (0, 1):
         write_finished(tmp_path, number)
     seen = []
@@ -197,33 +192,33 @@ def test_ctrl_c_leaves_what_is_finished(tmp_path, painter, options):
     )
 
 
-WRONG = [
-    ({"episode": 4}, InvalidArgument, "Available: 0"),
-    ({"workers": 0}, InvalidArgument, "workers"),
-    ({"height": -1}, InvalidArgument, "height"),
-    ({"quality": "low"}, UnknownName, "draft"),
-    ({"max_fps": 0}, InvalidArgument, "fps"),
-    ({"camera": 1.5}, InvalidArgument, "A camera must be a name"),
-    ({"camera": {"zoom": 1}}, UnknownName, "distance"),
-    ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "original video"),
-    ({"engine": "spark"}, UnknownName, "slurm"),
-    ({"engine": 3}, InvalidArgument, r"mjrec\.LocalEngine\(\)"),
-    ({"engine": LocalEngine(1), "workers": 2}, InvalidArgument, "its own workers"),
-]
-
-
-@pytest.mark.parametrize(("options", "kind", "words"), WRONG)
-def test_what_cannot_be_is_one_clear_error(tmp_path, options, kind, words):
-    """And nothing is written."""
+@pytest.mark.parametrize(
+    ("options", "kind", "message"),
+    [
+        ({"episode": 4}, InvalidArgument, "Available: 0"),
+        ({"workers": 0}, InvalidArgument, "workers"),
+        ({"height": -1}, InvalidArgument, "height"),
+        ({"quality": "low"}, UnknownName, "draft"),
+        ({"max_fps": 0}, InvalidArgument, "fps"),
+        ({"camera": 1.5}, InvalidArgument, "A camera must be a name"),
+        ({"camera": {"zoom": 1}}, UnknownName, "distance"),
+        ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "original video"),
+        ({"engine": "spark"}, UnknownName, "slurm"),
+        ({"engine": 3}, InvalidArgument, r"mjrec\.LocalEngine\(\)"),
+        ({"engine": LocalEngine(1), "workers": 2}, InvalidArgument, "its own workers"),
+    ],
+)
+def test_wrong_arguments_are_an_error_and_write_nothing(
+    tmp_path, names, options, kind, message
+):
     write_finished(tmp_path)
-    before = sorted(tmp_path.iterdir())
-    with pytest.raises(kind, match=words):
+    before = names(tmp_path)
+    with pytest.raises(kind, match=message):
         render_videos(tmp_path, **options)
-    assert sorted(tmp_path.iterdir()) == before
+    assert names(tmp_path) == before
 
 
-def test_what_is_no_recording_is_said(tmp_path):
-    """A directory without any, a path to nothing, and a file of another name."""
+def test_anything_but_a_recording_is_an_error(tmp_path):
     with pytest.raises(InvalidArgument, match="contains no recordings"):
         render_videos(tmp_path)
     with pytest.raises(InvalidArgument, match="does not exist"):
@@ -233,35 +228,36 @@ def test_what_is_no_recording_is_said(tmp_path):
         render_videos(copy)
 
 
-# By an engine's workers
+# On an engine
 
 
-def test_progress_counts_videos_as_they_come(tmp_path, painter):
-    """Each recording is taken for a video until it is over; frames are not known."""
+def test_progress_of_an_engine_counts_finished_videos(tmp_path, painter):
+    """Each recording counts as a video until it is finished; frames are unknown."""
     write_finished(tmp_path, 0)
     write_finished(tmp_path, 1, frames=False)
     write_log(tmp_path, 2, video=None)
     seen = []
-    render_videos(tmp_path, engine=Here(), on_progress=seen.append)
+    render_videos(tmp_path, engine=InlineExecutor(), on_progress=seen.append)
     counts = [(now.videos, now.videos_done, now.frames_done) for now in seen]
     assert counts == [(3, 0, 0), (3, 1, 5), (3, 2, 5), (2, 2, 5)]
     assert {now.frames for now in seen} == {None}
 
 
-def test_a_job_whose_workers_die_is_that_videos_failure(tmp_path, painter):
-    """The manifest says so, and the rest goes on."""
+def test_a_job_whose_workers_die_fails_its_video_only(tmp_path, painter):
+    """The manifest has the reason."""
     for number in (0, 1):
         write_finished(tmp_path, number)
-    manifest = write_pending_manifest(tmp_path, 0, 1)
-    rendered = render_videos(tmp_path, engine=Here("video000000"))
+    write_pending_manifest(tmp_path, 0, 1)
+    rendered = render_videos(tmp_path, engine=InlineExecutor("video000000"))
     assert rendered.failures == {f"{VIDEO}.mp4": DIED}
     assert len(rendered.videos) == 1
-    [pending] = json.loads(manifest.read_text())["mjrec"]["pending"]
+    [pending] = manifest_of(tmp_path)["mjrec"]["pending"]
     assert pending["reason"] == DIED
 
 
-def test_workers_get_what_rendering_needs(tmp_path, painter, monkeypatch):
-    """One thread each, this user's models and trust, and where all see files."""
+def test_workers_get_environment_models_and_an_absolute_path(
+    tmp_path, painter, monkeypatch
+):
     monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     monkeypatch.chdir(tmp_path)
@@ -269,7 +265,7 @@ def test_workers_get_what_rendering_needs(tmp_path, painter, monkeypatch):
     digest = "0123456789abcdef" * 4
     note_models([digest, digest[::-1]])
     (tmp_path / f"openaigym.model.{digest[:16]}.mjb.gz").touch()
-    engine = Here()
+    engine = InlineExecutor()
     render_videos(Path(), engine=engine)
     environ = {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
     assert engine.work["environ"] == environ

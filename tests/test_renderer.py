@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of our own renderer, beside whoever else draws in the process."""
+"""Frames of `SceneRenderer`, also beside other renderers in the process."""
 
 import gc
 import os
@@ -18,7 +18,7 @@ from mjrec.simulation.renderer import SceneRenderer
 ASSETS = Path(__file__).parents[1] / "assets"
 SIZE = {"height": 50, "width": 70}
 
-# Small shadow map: most of the time of a small frame goes there.
+# The shadow map is small, as it takes most of the time of a small frame.
 TABLE = """
 <mujoco>
   <visual><quality shadowsize="256"/><map zfar="50"/></visual>
@@ -55,20 +55,20 @@ def table(tmp_path):
     return load(tmp_path / "table.xml")
 
 
-def content(model):
+def saved(model):
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
-def drawn_anew(model, data):
+def rendered(model, data):
     with SceneRenderer(model, camera="above", **SIZE) as renderer:
         return renderer.render(data)
 
 
 def run_script(script, **environment):
-    """Run a program that has `load` and `SceneRenderer`; return what it prints."""
-    # mujoco sets it for its backend, and it would forbid the child another one.
+    """Run a program that has `load` and `SceneRenderer`; return its output."""
+    # mujoco sets this variable, which would forbid the child another backend.
     inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
     head = f"""
 import os, sys, warnings
@@ -84,23 +84,23 @@ def load(name):
 """
     env = {**inherited, **environment}
     done = run_python(head + textwrap.dedent(script), env=env)
-    # Other packages' deprecations are theirs to mend.
+    # Other packages may print deprecation warnings.
     assert not re.search("Exception ignored|Error|mjrec", done.stderr), done.stderr
     return done.stdout
 
 
-# --- the frames ----------------------------------------------------------------------
+# --- Frames --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "camera"),
     [("showcase", "tracking"), ("walker_on_plane", "chase"), ("pendulum", -1)],
 )
-def test_frames_are_those_of_mujocos_own_renderer(name, camera):
-    """Byte for byte, along a trajectory that is the one without frames."""
+def test_frames_equal_those_of_mujoco_renderer(name, camera):
+    """Rendering changes neither the model nor the trajectory."""
     path = ASSETS / f"{name}.xml"
     (model, data), (_, alone) = load(path), load(path)
-    before = content(model)
+    before = saved(model)
     with (
         mujoco.Renderer(model, 50, 70) as theirs,
         SceneRenderer(model, camera=camera, **SIZE) as ours,
@@ -113,11 +113,10 @@ def test_frames_are_those_of_mujocos_own_renderer(name, camera):
             assert np.array_equal(frame, theirs.render())
     mujoco.mj_step(model, alone, 180)
     assert np.array_equal(data.geom_xpos, alone.geom_xpos)
-    assert content(model) == before
+    assert saved(model) == before
 
 
-def test_frames_are_the_same_on_osmesa():
-    """Byte for byte, on the backend that draws without EGL."""
+def test_frames_equal_those_of_mujoco_renderer_on_osmesa():
     script = """
         model, data = load("showcase")
         with (
@@ -133,31 +132,31 @@ def test_frames_are_the_same_on_osmesa():
 
 
 def test_a_frame_may_be_larger_than_the_models_buffer(table):
-    """The buffer grows on a copy: not one byte of the user's model changes."""
+    """The user's model stays the same."""
     model, data = table
-    before = content(model)
+    before = saved(model)
     with SceneRenderer(model, height=700, width=900, camera="above") as renderer:
         frame = renderer.render(data)
         renderer.model_changed()
     assert frame[350:, 450].std() > 5
-    assert content(model) == before
+    assert saved(model) == before
 
 
 @pytest.mark.parametrize(("shadowsize", "drawn"), [(2048, 1024), (256, 256)])
-def test_a_draft_is_the_model_with_less(table, shadowsize, drawn):
-    """No multisampling, a shadow map of at most 1024; the model is left alone."""
+def test_a_draft_has_no_multisampling_and_a_small_shadow_map(table, shadowsize, drawn):
+    """The user's model stays the same."""
     model, data = table
     model.vis.quality.shadowsize = shadowsize
-    before = content(model)
+    before = saved(model)
     with SceneRenderer(model, camera="above", quality="draft", **SIZE) as renderer:
         draft = renderer.render(data)
-    assert content(model) == before
+    assert saved(model) == before
     model.vis.quality.shadowsize = drawn
     model.vis.quality.offsamples = 0
-    assert np.array_equal(draft, drawn_anew(model, data))
+    assert np.array_equal(draft, rendered(model, data))
 
 
-# --- what changes in the model -------------------------------------------------------
+# --- Changes of the model ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -172,8 +171,8 @@ def test_a_draft_is_the_model_with_less(table, shadowsize, drawn):
     ],
     ids=["hills", "paint", "roof", "plane", "texture", "sharpness"],
 )
-def test_what_changes_in_the_model_shows(table, change):
-    """At once, or, of what a context keeps, after `model_changed`."""
+def test_changes_of_the_model_show(table, change):
+    """Colors show at once, data uploaded to OpenGL after `model_changed`."""
     model, data = table
     with SceneRenderer(model, camera="above", **SIZE) as renderer:
         before = renderer.render(data)
@@ -182,23 +181,23 @@ def test_what_changes_in_the_model_shows(table, change):
         assert not np.array_equal(before, recoloured)
         change(model)
         mujoco.mj_forward(model, data)
-        expected = drawn_anew(model, data)
+        expected = rendered(model, data)
         assert not np.array_equal(recoloured, expected)
         renderer.model_changed()
         assert np.array_equal(renderer.render(data), expected)
 
 
-# --- whoever else draws --------------------------------------------------------------
+# --- Other renderers -----------------------------------------------------------------
 
 
-def gymnasiums():
+def gymnasium_scene():
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
     env.reset(seed=0)
     inner = env.unwrapped
     return env.render, (inner.model, inner.data), "track"
 
 
-def dm_controls():
+def dm_control_scene():
     suite = pytest.importorskip("dm_control.suite")
     physics = suite.load("cartpole", "swingup", task_kwargs={"random": 0}).physics
     simulation = (physics.model.ptr, physics.data.ptr)
@@ -206,11 +205,12 @@ def dm_controls():
 
 
 @pytest.mark.parametrize(
-    "make", [gymnasiums, pytest.param(dm_controls, marks=pytest.mark.dm_control)]
+    "make",
+    [gymnasium_scene, pytest.param(dm_control_scene, marks=pytest.mark.dm_control)],
 )
 def test_an_environment_keeps_its_context(make):
     """Gymnasium's viewer never makes its context current again."""
-    # A context that an earlier test has left is not to go between two frames.
+    # A context from an earlier test must not be freed between two frames.
     gc.collect()
     theirs, (model, data), camera = make()
     before = theirs()
@@ -230,11 +230,11 @@ def test_an_environment_keeps_its_context(make):
     assert np.array_equal(before, theirs())
 
 
-# --- its life ------------------------------------------------------------------------
+# --- Errors and ends -----------------------------------------------------------------
 
 
 def test_a_frame_beyond_memory_is_an_error():
-    """The error of mujoco comes home, and the process lives on."""
+    """The process can render other frames."""
     script = """
         import resource
         resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
@@ -252,28 +252,27 @@ def test_a_frame_beyond_memory_is_an_error():
 @pytest.mark.parametrize(
     "environment", [{"MUJOCO_GL": "off"}, {"MUJOCO_GL": "glfw", "DISPLAY": ""}]
 )
-def test_without_gl_there_is_one_error_with_the_way_out(environment):
-    """It says which backend and why, and names `mjrec doctor`."""
+def test_the_error_without_gl_names_backend_and_doctor(environment):
     script = """
-        warnings.simplefilter("ignore")  # GLFW warns, and goes on
+        warnings.simplefilter("ignore")  # GLFW only warns
         try:
             SceneRenderer(load("pendulum")[0], **SIZE)
         except GLError as error:
             print(error)
     """
-    said = run_script(script, **environment)
-    assert f"MUJOCO_GL {environment['MUJOCO_GL']!r}: " in said
-    assert "`mjrec doctor`" in said
+    output = run_script(script, **environment)
+    assert f"MUJOCO_GL {environment['MUJOCO_GL']!r}: " in output
+    assert "`mjrec doctor`" in output
 
 
 @pytest.mark.parametrize("order", ["ours, theirs", "theirs, ours"])
-def test_leaving_without_closing_is_silent(order):
-    """Both mujoco and dm_control shut EGL down at exit, each when it likes."""
+def test_exit_without_closing_is_silent(order):
+    """Both mujoco and dm_control shut EGL down at exit, in any order."""
     script = """
         import gymnasium
         try:
             from dm_control import suite
-        except Exception:  # not with every mujoco
+        except Exception:  # it fails with some mujoco versions
             suite = None
 
         def theirs():
@@ -300,13 +299,10 @@ def test_leaving_without_closing_is_silent(order):
 
 
 @pytest.mark.parametrize(
-    ("drawn_by", "is_told"),
-    [("SceneRenderer", True), ("mujoco.Renderer", True), ("nobody", False)],
+    ("drawn_by", "errors"), [("SceneRenderer", 2), ("mujoco.Renderer", 1), (None, 0)]
 )
-def test_a_child_forked_from_who_has_drawn_is_told_instead_of_hanging(
-    drawn_by, is_told
-):
-    """Mesa's threads are not copied by fork, and their work is waited for."""
+def test_rendering_in_a_fork_of_a_process_that_rendered_is_an_error(drawn_by, errors):
+    """It would hang, as fork does not copy Mesa's threads."""
     script = f"""
         warnings.simplefilter("ignore")  # Python 3.12 warns of fork with threads
         model, data = load("pendulum")
@@ -325,13 +321,12 @@ def test_a_child_forked_from_who_has_drawn_is_told_instead_of_hanging(
                     assert use().shape == (50, 70, 3)
                 except GLError as error:
                     assert "fork" in str(error) and "spawn" in str(error)
-                    print("told", flush=True)
+                    print("error", flush=True)
             renderer = None
-            # As children of multiprocessing end. What mujoco does at exit to a
-            # display without contexts hangs in a forked child.
+            # Children of multiprocessing end like this. mujoco's exit handler
+            # hangs in a forked child on a display without contexts.
             os._exit(0)
         assert os.waitpid(child, 0)[1] == 0
         assert uses[-1]().shape == (50, 70, 3)
     """
-    told = "told\n" * (1 + (drawn_by == "SceneRenderer")) if is_told else ""
-    assert run_script(script) == told
+    assert run_script(script) == "error\n" * errors

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong while videos are rendered costs no more than it must.
+"""Failures while videos are rendered.
 
-One clear error; the video stays pending, and the manifest says why; nothing is left
-half-written; all other episodes are rendered, and a later try finds all it needs.
+Each is one error. The video stays pending, and the manifest has the reason. No file is
+half-written, all other episodes are rendered, and a later try succeeds.
 """
 
 import contextlib
@@ -29,12 +29,12 @@ FRAMES = 5
 
 
 @pytest.fixture
-def two(tmp_path, painter):
-    """A directory with two pending videos and a manifest that says so."""
+def directory(tmp_path, painter):
+    """A directory with two pending videos and its manifest."""
     directory = tmp_path / "two"
     directory.mkdir()
     for episode_id in range(2):
-        # Metadata of more bytes than the video has.
+        # The metadata are larger than the video.
         write_log(directory, episode_id, options={"why": 3000 * "x"})
     write_pending_manifest(directory, 0, 1)
     return directory
@@ -45,13 +45,13 @@ def finish(directory, **options):
 
 
 def reasons_in(directory):
-    """Return why the videos are pending, by their names."""
+    """Return the reasons of pending videos by their names."""
     pending = manifest_of(directory)["mjrec"]["pending"]
     return {entry["video"]: entry.get("reason") for entry in pending}
 
 
-def check_nothing_is_half(directory):
-    """Whatever has a final name is whole, and nothing else is there."""
+def check_files_are_whole(directory):
+    """Check that all files are complete, and that there are no temporary ones."""
     assert not list(directory.glob(".*"))
     for video in directory.glob("*.mp4"):
         assert len(frames_of(video)) == FRAMES
@@ -66,9 +66,9 @@ def check_nothing_is_half(directory):
             assert reader.frame_count == FRAMES
 
 
-def check_all_is_there_after_another_try(directory):
+def check_another_try_succeeds(directory):
     assert not [each for each in finish(directory) if each.failures]
-    check_nothing_is_half(directory)
+    check_files_are_whole(directory)
     assert len(list(directory.glob("*.mp4"))) == 2
     assert reasons_in(directory) == {}
 
@@ -76,8 +76,8 @@ def check_all_is_there_after_another_try(directory):
 # Encoders that are killed or hang
 
 
-def use_encoder(folder, monkeypatch, *, of, instead):
-    """Let one video's encoder do something else, in the shell; all others encode."""
+def replace_encoder(folder, monkeypatch, *, of, instead):
+    """Let one video's encoder run a shell command; all others encode."""
     program = folder / "ffmpeg"
     program.write_text(
         "#!/bin/sh\n"
@@ -88,80 +88,79 @@ def use_encoder(folder, monkeypatch, *, of, instead):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
 
 
-def test_a_killed_encoder_gets_a_second_try(two, tmp_path, monkeypatch, caplog):
-    """In mid-video; every frame is in the file once, and each is told once."""
+def test_a_killed_encoder_gets_a_second_try(directory, tmp_path, monkeypatch, caplog):
+    """Progress counts every frame once."""
     flag = tmp_path / "killed"
     killed = "head -c 3000 >/dev/null; echo no memory >&2; kill -9 $$"
     once = f"if mkdir {flag} 2>/dev/null; then {killed}; fi"
-    use_encoder(tmp_path, monkeypatch, of="video000000", instead=once)
-    told = []
-    results = finish(two, on_progress=told.append)
+    replace_encoder(tmp_path, monkeypatch, of="video000000", instead=once)
+    seen = []
+    results = finish(directory, on_progress=seen.append)
     assert flag.exists()
     assert not [each for each in results if each.failures]
     assert "Restarting the video" in caplog.text
     assert "no memory" in caplog.text
-    assert max(progress.frames_done for progress in told) == 2 * FRAMES
-    check_nothing_is_half(two)
+    assert max(progress.frames_done for progress in seen) == 2 * FRAMES
+    check_files_are_whole(directory)
 
 
-# Takes more than five seconds: the encoder's timeout, twice.
+# Takes more than five seconds: it waits twice for the timeout.
 @parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
-def test_an_encoder_that_hangs_leaves_the_video_pending(
-    instead, two, tmp_path, monkeypatch
+def test_the_video_of_a_hanging_encoder_stays_pending(
+    instead, directory, tmp_path, monkeypatch
 ):
-    """Whether it takes nothing or does not end; the other video is rendered."""
+    """The other video is rendered."""
     monkeypatch.setenv("MJREC_TIMEOUT", "2")
-    use_encoder(tmp_path, monkeypatch, of="video000000", instead=instead)
-    # More than a pipe takes.
+    replace_encoder(tmp_path, monkeypatch, of="video000000", instead=instead)
     began = time.monotonic()
-    _, second = finish(two)
+    _, second = finish(directory)
     assert time.monotonic() - began < 30
     assert second.videos
-    # The manifest says why.
-    [(name, reason)] = reasons_in(two).items()
+    [(name, reason)] = reasons_in(directory).items()
     assert name == VIDEO.format(0)
     assert "made no progress for 2 seconds" in reason
-    check_nothing_is_half(two)
+    check_files_are_whole(directory)
     monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
-    check_all_is_there_after_another_try(two)
+    check_another_try_succeeds(directory)
 
 
 # Full disks
 
-ROOM = [30, 800, 1600, 2500, 3000]
-
 
 @pytest.mark.parametrize(
     ("finished", "room"),
-    [(False, 100), (False, 4000), *((True, room) for room in ROOM)],
+    [
+        *((False, room) for room in (100, 4000)),
+        *((True, room) for room in (30, 800, 1600, 2500, 3000)),
+    ],
 )
-def test_a_full_disk_is_one_clear_error_wherever_it_comes(finished, room, two):
-    """Be it at the trajectory, the hashes, the video, its metadata or the manifest."""
+def test_a_full_disk_is_an_error_that_names_the_file(finished, room, directory):
+    """The disk fills at the trajectory, hashes, video, metadata or manifest."""
     if finished:
-        for recording in recordings_in_flight(two):
+        for recording in recordings_in_flight(directory):
             finish_trajectory(recording.path)
-        assert not list(two.glob("*.states.*"))
+        assert not list(directory.glob("*.states.*"))
     with file_size_limit(room):
-        failures = [str(each.failures) for each in finish(two)]
+        failures = [str(each.failures) for each in finish(directory)]
     for failure in failures:
         assert "File too large" in failure
-        assert str(two / "openaigym.") in failure
-    check_nothing_is_half(two)
-    assert not list(two.glob("*.mp4"))
-    assert list(reasons_in(two)) == [VIDEO.format(0), VIDEO.format(1)]
-    check_all_is_there_after_another_try(two)
+        assert str(directory / "openaigym.") in failure
+    check_files_are_whole(directory)
+    assert not list(directory.glob("*.mp4"))
+    assert list(reasons_in(directory)) == [VIDEO.format(0), VIDEO.format(1)]
+    check_another_try_succeeds(directory)
 
 
-# The whole way, with a simulation and OpenGL
+# With a simulation and OpenGL
 
 
 @pytest.mark.parametrize("render", ["deferred", "live"])
-def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(
+def test_a_black_video_is_suspect_in_its_metadata_and_the_log(
     render, tmp_path, play, caplog
 ):
-    """The metadata says so, and the log warns; with `strict` it is an error.
+    """With `strict` it is an error too, though the video stays.
 
-    Drawn live as its episode ends, else as the monitor closes. The video is there.
+    The error comes as a live episode ends, or as the monitor closes.
     """
     size = {"width": 40, "height": 32, "max_episode_steps": 3}
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", **size)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is pending in a directory is found, shared out, and done once."""
+"""Pending videos are found, claimed, and rendered once."""
 
-import json
 import time
 
 import pytest
-from recordings import add_facts
+from recordings import add_facts, manifest_of
 from trajectories_by_hand import (
     INFIX,
     write_finished,
@@ -33,19 +32,12 @@ def finish(directory, workers=1):
     return list(module.finish(directory, workers=workers))
 
 
-def manifest_in(directory):
-    [path] = directory.glob("*.manifest.json")
-    return json.loads(path.read_text())
-
-
-# What is pending
+# Pending
 
 
 @pytest.mark.parametrize("write", [write_log, write_finished])
-def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
-    write, tmp_path
-):
-    """Whether or not the trajectory has its final form."""
+def test_a_deferred_video_is_pending_until_it_and_its_metadata_exist(write, tmp_path):
+    """The trajectory may be a log or finished."""
     trajectory = write(tmp_path)
     plan = look_at(tmp_path, KEY)
     assert (plan.parts, plan.frame_count) == ((trajectory,), 5)
@@ -59,12 +51,13 @@ def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
 
 
 @pytest.mark.parametrize(("facts", "ended"), [({"candidate": True}, True), ({}, False)])
-def test_what_an_open_monitor_has_not_ended_is_its_own(facts, ended, tmp_path):
-    """Running or undecided, it may still be deleted; that of a dead one is pending."""
+def test_running_and_undecided_episodes_are_left_to_an_open_monitor(
+    facts, ended, tmp_path
+):
+    """They are pending once the monitor is dead."""
     log = write_log(tmp_path, ended=ended, **facts)
     write_log(tmp_path, 1)
     lock = Lock(tmp_path / lock_name(INFIX), "")
-    # What has ended is not its own.
     second = "openaigym.video.0.7.video000001.mp4"
     assert [list(each.videos) for each in finish(tmp_path)] == [[second]]
     assert is_in_flight(log)
@@ -77,8 +70,8 @@ def test_what_an_open_monitor_has_not_ended_is_its_own(facts, ended, tmp_path):
     assert result.videos
 
 
-def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(tmp_path):
-    """While that fails it stays: nobody could ever render it."""
+def test_a_trajectory_that_is_not_kept_is_deleted_after_its_video(tmp_path):
+    """While rendering fails, it stays."""
     write_log(tmp_path, kept=False)
     log = write_log(tmp_path, 1, kept=False, frames=False)
     assert [bool(each.failures) for each in finish(tmp_path)] == [False, True]
@@ -86,11 +79,13 @@ def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(tmp_path):
     assert [path.name for path in tmp_path.glob("*.trajectory.*")] == [log.name]
 
 
-# Who does it
+# Claims
 
 
-def test_what_another_process_has_is_left_to_it(tmp_path, painter):
-    """It is told, and not done twice; the lock file of a dead one is nobody's."""
+def test_an_episode_claimed_by_another_process_is_reported_and_skipped(
+    tmp_path, painter
+):
+    """A lock file whose process is dead does not count."""
     write_finished(tmp_path)
     lock = claim(tmp_path, KEY)
     assert lock is not None
@@ -103,15 +98,15 @@ def test_what_another_process_has_is_left_to_it(tmp_path, painter):
     write_pending_manifest(tmp_path, 0)
     [result] = finish(tmp_path, workers=None)
     assert result.videos
-    # No lock stays: of the episode, of the manifest, of the CPUs.
+    # No lock of episode, manifest or CPUs stays.
     assert not list(tmp_path.glob(".*"))
 
 
-# What fails
+# Failures
 
 
-def test_what_cannot_be_rendered_stops_nothing_else(tmp_path, caplog, painter):
-    """It is told with its reason, and stays pending."""
+def test_failed_episodes_have_reasons_and_stop_no_other(tmp_path, caplog, painter):
+    """They stay pending."""
     write_finished(tmp_path, 0).write_bytes(b"not HDF5 at all")
     write_finished(tmp_path, 1, frames=False, refusal="a plugin draws")
     write_finished(tmp_path, 2)
@@ -121,10 +116,9 @@ def test_what_cannot_be_rendered_stops_nothing_else(tmp_path, caplog, painter):
     *failed, last = finish(tmp_path)
     assert last.videos
     reasons = [reason for each in failed for reason in each.failures.values()]
-    for said, reason in zip(
-        ("Cannot read", "a plugin draws", "IndexError: ", "scene"), reasons, strict=True
-    ):
-        assert said in reason
+    expected = ("Cannot read", "a plugin draws", "IndexError: ", "scene")
+    for words, reason in zip(expected, reasons, strict=True):
+        assert words in reason
     assert "Traceback" in caplog.text
     assert len(finish(tmp_path)) == 4
 
@@ -133,7 +127,7 @@ def test_what_cannot_be_rendered_stops_nothing_else(tmp_path, caplog, painter):
 
 
 def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path):
-    """What a race leaves, a later run repairs, though there is nothing to render."""
+    """A later run repairs it, even with nothing to render."""
     write_finished(tmp_path)
     path = write_pending_manifest(tmp_path, 0)
     before = path.read_bytes()
@@ -142,18 +136,17 @@ def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path):
     assert path.read_bytes() == before
     lock.release()
     assert finish(tmp_path) == []
-    assert len(manifest_in(tmp_path)["videos"]) == 1
+    assert len(manifest_of(tmp_path)["videos"]) == 1
 
 
 @pytest.mark.parametrize("name", ["../elsewhere/x.mp4", "/x.mp4", "", 7, None])
-def test_a_manifest_names_no_video_elsewhere(name, tmp_path):
-    """Such an entry is dropped."""
+def test_entries_for_files_elsewhere_are_dropped_from_a_manifest(name, tmp_path):
     write_pending_manifest(tmp_path, 0, pending=[{"episode_id": 0, "video": name}])
     write_manifest_and_stats(tmp_path, INFIX)
-    assert manifest_in(tmp_path)["mjrec"]["pending"] == []
+    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
 
 
-# Facts, which may be anybody's
+# Facts, which may come from a hostile file
 
 FACTS = {"name": "x.mp4", "recording": "deferred"}
 
@@ -181,8 +174,10 @@ FACTS = {"name": "x.mp4", "recording": "deferred"}
         ),
     ],
 )
-def test_a_fact_that_cannot_be_is_named(key, value, tmp_path):
-    """With its file, at once, before anything of it is drawn."""
+def test_an_impossible_fact_is_an_error_that_names_it_and_the_file(
+    key, value, tmp_path
+):
+    """The error comes before anything is rendered."""
     path = write_log(tmp_path)
     add_facts(path, {key: value})
     start = time.monotonic()

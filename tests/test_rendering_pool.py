@@ -31,23 +31,23 @@ def ride(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def three():
-    """Three workers, which stay from test to test."""
-    with WorkerPool(3) as three:
-        yield three
+def pool_of_3():
+    """Three workers, shared by the tests of this module."""
+    with WorkerPool(3) as pool:
+        yield pool
 
 
 @pytest.fixture
-def one():
-    with WorkerPool(1) as one:
-        yield one
+def pool_of_1():
+    with WorkerPool(1) as pool:
+        yield pool
 
 
 def pids(pool):
     return [worker.child.pid for worker in pool._workers if worker.child is not None]
 
 
-def draw_otherwise(monkeypatch, body):
+def patch_drawing(monkeypatch, body):
     """Let workers draw with other code, which may call `draw(self, index, **rest)`."""
     code = f"""
 import logging, os, pathlib, signal, sys, threading, time
@@ -62,54 +62,51 @@ worker.main()
     monkeypatch.setattr(child_python, "python_command", lambda _: command)
 
 
-# In order, whoever draws
+# Frames in order
 
 
 @pytest.mark.parametrize("indices", [range(FRAMES), [0, 2, 3, 7, 8]])
-def test_any_workers_give_what_was_seen(ride, one, three, indices):
-    """Byte for byte, over an infinite plane, whose place depends on the frame before.
-
-    Of some frames too; and who draws is known from the first frame on.
-    """
+def test_any_number_of_workers_renders_the_recorded_frames(
+    ride, pool_of_1, pool_of_3, indices
+):
+    """They are equal byte for byte, even if an infinite plane follows the camera."""
     expected = [ride.frames[index] for index in indices]
-    assert np.array_equal(list(one.frames(ride.path, indices)), expected)
-    assert np.array_equal(list(three.frames(ride.path, indices, View())), expected)
-    assert len(pids(three)) == 3
+    assert np.array_equal(list(pool_of_1.frames(ride.path, indices)), expected)
+    assert np.array_equal(list(pool_of_3.frames(ride.path, indices, View())), expected)
+    assert len(pids(pool_of_3)) == 3
     strings = {"gl_vendor", "gl_renderer", "gl_version"}
-    assert three.gl_facts.keys() - {"gl_device"} == strings
-    assert os.getpriority(os.PRIO_PROCESS, pids(one)[0]) == 10
+    assert pool_of_3.gl_facts.keys() - {"gl_device"} == strings
+    assert os.getpriority(os.PRIO_PROCESS, pids(pool_of_1)[0]) == 10
 
 
-def test_few_frames_are_kept_here(tmp_path, three):
-    """However slow the caller is: two of each worker, besides what its pipe holds."""
+def test_at_most_two_frames_of_each_worker_are_waiting(tmp_path, pool_of_3):
     ride = record(tmp_path, count=40)
     kept = []
-    for frame in three.frames(ride.path, range(40)):
-        # They are the caller's to keep, and to write to.
+    for frame in pool_of_3.frames(ride.path, range(40)):
+        # The caller may overwrite a frame.
         kept.append(frame.copy())
         frame[:] = 1
-        assert all(len(worker.arrived) <= 2 for worker in three._workers)
+        assert all(len(worker.arrived) <= 2 for worker in pool_of_3._workers)
     assert np.array_equal(kept, ride.frames)
 
 
-def test_workers_stay_and_go_over_to_other_views(ride, three):
-    """Larger and smaller frames, and none that shows what the last have changed."""
-    list(three.frames(ride.path, range(5)))
-    before = pids(three)
+def test_workers_stay_for_other_sizes_and_after_unfinished_calls(ride, pool_of_3):
+    """Changes of the model by earlier calls do not show."""
+    list(pool_of_3.frames(ride.path, range(5)))
+    before = pids(pool_of_3)
     for height in (20, 90):
-        for frame in three.frames(ride.path, range(5), View(height=height)):
+        for frame in pool_of_3.frames(ride.path, range(5), View(height=height)):
             assert frame.shape == (height, WIDTH, 3)
-    assert pids(three) == before
-    # Some are dropped.
-    next(three.frames(ride.path, range(FRAMES)))
-    assert np.array_equal(list(three.frames(ride.path, range(FRAMES))), ride.frames)
+    assert pids(pool_of_3) == before
+    # The caller abandons this call after a frame.
+    next(pool_of_3.frames(ride.path, range(FRAMES)))
+    assert np.array_equal(list(pool_of_3.frames(ride.path, range(FRAMES))), ride.frames)
 
 
-def test_a_grid_is_what_each_camera_shows(ride, three, tmp_path):
-    """Byte for byte; and so it is where the log has become HDF5."""
+def test_a_grid_has_each_cameras_frame_byte_for_byte(ride, pool_of_3, tmp_path):
     side = record(tmp_path, camera="side")
     path, numbers = finish_trajectory(side.path), range(FRAMES)
-    frames = three.frames(path, numbers, cameras=[None, "rider", "side"])
+    frames = pool_of_3.frames(path, numbers, cameras=[None, "rider", "side"])
     for number, frame in zip(numbers, frames, strict=True):
         upper, lower = frame[:HEIGHT], frame[HEIGHT:]
         np.testing.assert_array_equal(upper[:, :WIDTH], side.frames[number])
@@ -118,11 +115,10 @@ def test_a_grid_is_what_each_camera_shows(ride, three, tmp_path):
         assert not lower[:, WIDTH:].any()
 
 
-# What goes wrong
+# Failures
 
 
-def test_a_killed_worker_is_replaced(tmp_path, caplog):
-    """What it was drawing is drawn again, and the log says so."""
+def test_killed_workers_are_replaced_without_losing_frames(tmp_path, caplog):
     ride = record(tmp_path, count=40)
     with WorkerPool(2) as pool:
         frames = pool.frames(ride.path, range(40))
@@ -134,12 +130,12 @@ def test_a_killed_worker_is_replaced(tmp_path, caplog):
     assert "killed by SIGKILL" in caplog.text
 
 
-def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
+def test_a_hanging_worker_is_replaced_and_its_stack_logged(
     ride, tmp_path, monkeypatch, caplog
 ):
-    """Nothing of it is missing or comes twice."""
+    """Every frame comes once."""
     hung = tmp_path / "hung"
-    draw_otherwise(
+    patch_drawing(
         monkeypatch,
         f"""
         hung = pathlib.Path({str(hung)!r})
@@ -154,34 +150,33 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
         pool._timeout.seconds = 0.5
         stacks = Child.stacks
 
-        def give_the_next_one_time(child):
+        def give_the_next_worker_time(child):
             pool._timeout.seconds = 120
             return stacks(child)
 
-        monkeypatch.setattr(Child, "stacks", give_the_next_one_time)
+        monkeypatch.setattr(Child, "stacks", give_the_next_worker_time)
         assert np.array_equal(list(frames), ride.frames)
     assert "it has drawn nothing for 0.5 seconds" in caplog.text
     assert "in draw_otherwise" in caplog.text
 
 
 def test_a_worker_that_dies_twice_is_an_error(ride, monkeypatch):
-    """It names the signal, the file, and what the worker said, with Python's stack."""
-    draw_otherwise(
+    """The error has the signal, the file, the worker's stderr and Python's stack."""
+    patch_drawing(
         monkeypatch,
         """
         print("llvm: out of registers", file=sys.stderr, flush=True)
         os.kill(os.getpid(), signal.SIGSEGV)
         """,
     )
-    words = r"(?s)SIGSEGV.*out of registers.*in draw_otherwise"
-    with WorkerPool(2) as pool, pytest.raises(Error, match=words) as caught:
+    message = r"(?s)SIGSEGV.*out of registers.*in draw_otherwise"
+    with WorkerPool(2) as pool, pytest.raises(Error, match=message) as caught:
         pool.frames(ride.path, range(FRAMES))
     assert str(ride.path) in str(caught.value)
 
 
-def test_what_a_worker_says_is_heard(ride, monkeypatch, caplog):
-    """Warnings are logged here; what a driver prints is not, however much."""
-    draw_otherwise(
+def test_a_workers_warnings_are_logged_and_prints_ignored(ride, monkeypatch, caplog):
+    patch_drawing(
         monkeypatch,
         """
         os.write(1, b"x" * 100_000)
@@ -196,11 +191,10 @@ def test_what_a_worker_says_is_heard(ride, monkeypatch, caplog):
     assert levels == {"no GPU": logging.ERROR}
 
 
-# Their life
+# Ends
 
 
-def test_forgotten_workers_end(ride):
-    """Garbage collection is enough."""
+def test_garbage_collection_ends_workers(ride):
     before = children()
     pool = WorkerPool(1)
     frames = pool.frames(ride.path, range(FRAMES))
@@ -211,26 +205,26 @@ def test_forgotten_workers_end(ride):
     assert children() == before
 
 
-def test_ctrl_c_while_a_frame_is_drawn(ride, one):
-    """It reaches only the parent; another worker draws for the next call."""
-    list(one.frames(ride.path, [0]))
-    [pid] = pids(one)
+def test_after_ctrl_c_another_worker_renders_the_next_call(ride, pool_of_1):
+    """Ctrl-C reaches only the parent."""
+    list(pool_of_1.frames(ride.path, [0]))
+    [pid] = pids(pool_of_1)
     large = View(height=1000, width=1400)
     with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
-        list(one.frames(ride.path, range(FRAMES), large))
+        list(pool_of_1.frames(ride.path, range(FRAMES), large))
 
-    assert np.array_equal(list(one.frames(ride.path, [4])), [ride.frames[4]])
-    [another] = pids(one)
+    assert np.array_equal(list(pool_of_1.frames(ride.path, [4])), [ride.frames[4]])
+    [another] = pids(pool_of_1)
     assert another != pid
     assert os.getsid(another) == another
 
 
-# What draws
+# OpenGL
 
 
-# Takes more than five seconds: both backends are tried by processes of their own.
-def test_where_egl_does_not_work_another_backend_draws(ride, monkeypatch):
-    """No frame is lost or drawn by EGL, and nothing is tried twice."""
+# Takes more than five seconds: a process tries each backend.
+def test_without_egl_osmesa_renders_all_frames(ride, monkeypatch):
+    """Each backend is tried once."""
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
@@ -243,9 +237,9 @@ def test_where_egl_does_not_work_another_backend_draws(ride, monkeypatch):
     assert b"MUJOCO_GL=osmesa" in environment
 
 
-# CPUs, shared by all that render into a directory
+# CPUs, shared by all processes that render into a directory
 
-# Takes what is free of the two CPUs of argv[1], says how many, and waits.
+# Takes the free CPUs of the directory in argv[1], prints their number, and waits.
 HOLDER = """
 import pathlib, sys
 from mjrec.rendering import pool
@@ -256,8 +250,7 @@ sys.stdin.read()
 """
 
 
-def test_the_cpus_of_another_process_are_waited_for(tmp_path, monkeypatch):
-    """Until it rests or dies; the files of a dead one do not count."""
+def test_a_pool_waits_until_another_process_with_all_cpus_dies(tmp_path, monkeypatch):
     monkeypatch.setattr(pool_module, "usable_cpus", lambda: 2)
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)],

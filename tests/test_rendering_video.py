@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording becomes videos with everything that belongs to them."""
+"""Rendering a recording into videos, with metadata, hashes and captions."""
 
 import hashlib
 import json
@@ -59,8 +59,9 @@ def metadata_of(video):
         (2, None, [[0, 4], [5, 5]], 10),
     ],
 )
-def test_max_fps_leaves_frames_out(stride, max_fps, steps, fps, tmp_path):
-    """At the recording or now: playback stays real time."""
+def test_max_fps_drops_frames_and_keeps_real_time(
+    stride, max_fps, steps, fps, tmp_path
+):
     trajectory = write_finished(tmp_path, steps=5, stride=stride)
     video = render(trajectory, variant=Variant(max_fps=max_fps))
     metadata = metadata_of(video)
@@ -70,8 +71,8 @@ def test_max_fps_leaves_frames_out(stride, max_fps, steps, fps, tmp_path):
         assert container.streams.video[0].average_rate == fps
 
 
-def test_without_a_frame_there_is_metadata_or_an_error(tmp_path, names):
-    """Where the recording says that it broke, there is nothing to wait for any more."""
+def test_a_broken_recording_without_frames_gets_only_metadata(tmp_path, names):
+    """A recording that cannot be rendered is an error, and nothing is written."""
     broken = write_log(tmp_path, frames=False, broken_reason="a marker")
     assert not render_video([broken], workers=Painter()).videos
     metadata = metadata_of(tmp_path / f"{STEM}.mp4")
@@ -90,8 +91,8 @@ def test_without_a_frame_there_is_metadata_or_an_error(tmp_path, names):
         *(f"{STEM}.side.mp4", 5, None),
     ],
 )
-def test_a_trajectory_writes_no_video_but_its_own(name, tmp_path):
-    """What a file says it is to be called may come from anybody."""
+def test_a_trajectory_cannot_name_a_video_of_another_episode(name, tmp_path):
+    """The name in a trajectory may come from a hostile file."""
     trajectory = write_log(tmp_path, video=None)
     with pytest.raises(UnreadableFile, match="its episode"):
         video_path(trajectory, {"video": {"name": name}})
@@ -103,7 +104,7 @@ FIRST, SIDE, SECOND = (f"{STEM}{part}.mp4" for part in ("", ".side", ".camera3")
 
 
 def write_with_cameras(directory, **more):
-    """Write a trajectory whose video is promised with three cameras, and more facts."""
+    """Write a trajectory whose video is pending, from three cameras."""
     video = {"name": FIRST, "quality": "full", "fps": None, "max_fps": None}
     cameras = [None, "side", {"distance": 2.0}]
     log = write_log(directory, scene={"label": "eye"})
@@ -115,8 +116,7 @@ def write_with_cameras(directory, **more):
 
 
 @pytest.mark.parametrize("camera", [None, "side"])
-def test_an_interruption_leaves_no_cameras_video(camera, tmp_path, names):
-    """Whichever it comes in."""
+def test_an_interruption_leaves_no_video_of_any_camera(camera, tmp_path, names):
     trajectory, painter = write_with_cameras(tmp_path), Painter()
 
     def interrupt(_, view, index):
@@ -129,19 +129,18 @@ def test_an_interruption_leaves_no_cameras_video(camera, tmp_path, names):
     assert names(tmp_path) == [trajectory.name]
 
 
-def test_blank_videos_stop_no_other(tmp_path):
-    """With `strict`, all are named when all are there."""
+def test_strict_rendering_names_all_blank_videos_and_keeps_them(tmp_path):
+    """Captions do not hide that they are blank."""
     trajectory = write_with_cameras(tmp_path, annotate=True)
     done = render_video([trajectory], workers=Painter(plain=True), strict=True)
     assert set(done.blank) == set(done.videos) == {FIRST, SIDE, SECOND}
     assert is_done(tmp_path / FIRST)
-    # However much is written on them.
     for name in (FIRST, SIDE, SECOND):
         assert metadata_of(tmp_path / name)["suspect_constant"] is True
 
 
-def test_second_names_are_given_at_the_end(tmp_path):
-    """Of every camera; again where they are missing or lead to what is replaced."""
+def test_finishing_gives_each_cameras_video_its_second_name(tmp_path):
+    """It restores a name that is missing or leads to a replaced file."""
     trajectory = write_with_cameras(tmp_path, also_named="rl-video-episode-0.mp4")
     second = tmp_path / "rl-video-episode-0.side.mp4"
     for rerendered in (True, True, False):
@@ -156,8 +155,8 @@ def test_second_names_are_given_at_the_end(tmp_path):
         assert metadata_of(tmp_path / SIDE)["also_named"] == second.name
 
 
-def test_all_videos_of_an_episode_are_counted_and_listed(tmp_path, painter):
-    """When the first is there, and it is then not pending any more."""
+def test_all_cameras_are_counted_and_listed(tmp_path, painter):
+    """An episode is rendered again when a video is missing."""
     write_with_cameras(tmp_path)
     manifest, seen = write_pending_manifest(tmp_path, 0), []
     [result] = finish(tmp_path, workers=1, on_progress=seen.append)
@@ -168,7 +167,7 @@ def test_all_videos_of_an_episode_are_counted_and_listed(tmp_path, painter):
         content = json.loads(manifest.read_text())
         assert {video for video, _ in content["videos"]} == {FIRST, SIDE, SECOND}
         assert content["mjrec"]["pending"] == []
-        # So it is where the monitor left none.
+        # Recovery writes the same manifest.
         manifest.unlink()
         recover(tmp_path)
     (tmp_path / FIRST).unlink()
@@ -177,8 +176,8 @@ def test_all_videos_of_an_episode_are_counted_and_listed(tmp_path, painter):
     assert len(frames_of(tmp_path / SIDE)) == 5
 
 
-def test_rendering_again_replaces_no_recorded_video(tmp_path, painter):
-    """A camera that was recorded too has its file already."""
+def test_rerendering_never_replaces_a_recorded_video(tmp_path, painter):
+    """A recorded camera's file exists already."""
     trajectory = write_with_cameras(tmp_path)
     render(trajectory)
     before = (tmp_path / SIDE).read_bytes()
@@ -193,8 +192,7 @@ def test_rendering_again_replaces_no_recorded_video(tmp_path, painter):
 # Captions
 
 
-def test_captions_are_on_the_frames_that_are_hashed(tmp_path):
-    """Hash by hash what the function gives, and the metadata says so."""
+def test_hashed_frames_have_their_captions(tmp_path):
     painter, expected = Painter((64, 96)), []
     trajectory = write_with_cameras(tmp_path, annotate=True)
     render(trajectory, painter)
@@ -211,31 +209,30 @@ def test_captions_are_on_the_frames_that_are_hashed(tmp_path):
 @pytest.mark.parametrize(
     ("asked", "name"), [(None, "5fps"), (False, "5fps.plain"), (True, "5fps.annotated")]
 )
-def test_captions_are_as_recorded_or_as_asked_for(
+def test_annotate_overrides_the_recorded_choice_and_is_in_the_name(
     recorded, asked, name, tmp_path, painter
 ):
-    """And the name of the file says what is other."""
     write_with_cameras(tmp_path, annotate=recorded)
     [video] = render_videos(tmp_path, fps=5, annotate=asked).videos
     assert video == f"{STEM}.{name}.mp4"
-    written = recorded if asked is None else asked
-    assert ("annotated" in metadata_of(tmp_path / video)) is written
+    expected = recorded if asked is None else asked
+    assert ("annotated" in metadata_of(tmp_path / video)) is expected
 
 
-def test_captions_tell_time_by_what_is_known(tmp_path):
-    """The simulation's own clock from the reset on, else steps of a known length."""
+def test_captions_show_simulated_time_or_count_steps(tmp_path):
+    """Without a clock or a timestep, they show no time."""
     with open_trajectory(record_ride(tmp_path).path) as reader:
         assert [c.time for c in captions(reader, [0, 1])] == [None, None]
     with open_trajectory(write_log(tmp_path, 1, steps=3, stride=2)) as reader:
-        said = [(c.step, c.time) for c in captions(reader, [0, 1, 2])]
-        assert said == [(0, 0.0), (2, 0.1), (3, 0.15)]
-        facts, shown = reader.facts, reader.kind("snapshot")
-        clock = row_dtype(state=packed([("time", ("<f8", (1,)))]), snapshot=shown)
+        shown = [(c.step, c.time) for c in captions(reader, [0, 1, 2])]
+        assert shown == [(0, 0.0), (2, 0.1), (3, 0.15)]
+        facts, snapshot = reader.facts, reader.kind("snapshot")
+        clock = row_dtype(state=packed([("time", ("<f8", (1,)))]), snapshot=snapshot)
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
     span = logs.begin(name, facts, clock)
     for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
         add_row(span, step, reward=reward, state=time, snapshot=grey(step))
     logs.close()
     with open_trajectory(logs.path_of(name)) as reader:
-        said = [(c.time, c.reward) for c in captions(reader, [0, 1, 2])]
-        assert said == [(0.0, 0.0), (0.5, 0.25), (2.0, -0.75)]
+        shown = [(c.time, c.reward) for c in captions(reader, [0, 1, 2])]
+        assert shown == [(0.0, 0.0), (0.5, 0.25), (2.0, -0.75)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded states follow from each other."""
+"""Each recorded state follows from the state and controls before it."""
 
 import importlib.util
 
@@ -17,14 +17,14 @@ from mjrec.simulation.states import read_state, set_state, state_dtype
 GYMNASIUM = ("HalfCheetah", "Humanoid", "Pusher", "Ant", "Hopper", "HumanoidStandup")
 GYMNASIUM += ("Swimmer", "InvertedPendulum", "InvertedDoublePendulum", "Reacher")
 GYMNASIUM += ("Walker2d",)
-# What begins far from rest, and what settles inside its reset, which only the warm
-# start of the solver remembers.
+# Two begin far from rest; finger-spin settles in its reset, which only the solver's
+# warm start remembers.
 SUITE = ("humanoid-run", "cheetah-run", "finger-spin")
 STEPS = 8
 
 
-def replayed(path, substeps):
-    """Return recorded states, and what follows from the ones before, from the first."""
+def check_states_follow(path, substeps):
+    """Check that state k and the controls of step k + 1 give state k + 1."""
     trajectory = mjrec.load_trajectory(path)
     model = trajectory.model()
     data = mujoco.MjData(model)
@@ -35,12 +35,11 @@ def replayed(path, substeps):
         data.ctrl[:] = trajectory.component("ctrl")[k + 1]
         mujoco.mj_step(model, data, nstep=substeps)
         mujoco.mj_getState(model, data, followed[k], spec)
-    return trajectory.states[1:], followed
+    assert trajectory.states[1:].tobytes() == followed.tobytes()
 
 
 @parametrize("name", GYMNASIUM, default=3, part=pytest.mark.environments)
 def test_gymnasium_states_follow_bit_for_bit(name, tmp_path):
-    """State k, the controls of step k + 1, and stepping give state k + 1."""
     env = gymnasium.make(f"{name}-v5")
     env.action_space.seed(0)
     with mjrec.Monitor(env, tmp_path, workers=0) as monitored:
@@ -50,12 +49,10 @@ def test_gymnasium_states_follow_bit_for_bit(name, tmp_path):
                 break
         substeps = env.unwrapped.frame_skip
     [path] = tmp_path.glob("*.h5")
-    recorded, followed = replayed(path, substeps)
-    assert recorded.tobytes() == followed.tobytes()
+    check_states_follow(path, substeps)
 
 
 def suite_tasks():
-    """Return the names of all tasks."""
     if importlib.util.find_spec("dm_control") is None:
         return []
     from dm_control import suite
@@ -66,7 +63,7 @@ def suite_tasks():
 @pytest.mark.dm_control
 @parametrize("name", suite_tasks(), default=SUITE, part=pytest.mark.environments)
 def test_suite_states_follow_bit_for_bit(name, tmp_path):
-    """Also where a task changes its model at every reset."""
+    """Some tasks change their model at every reset."""
     from dm_control import suite
 
     env = suite.load(*name.split("-", 1), task_kwargs={"random": 0})
@@ -78,11 +75,10 @@ def test_suite_states_follow_bit_for_bit(name, tmp_path):
                 monitored.step(random.uniform(spec.minimum, spec.maximum))
         substeps = round(env.control_timestep() / env.physics.timestep())
     for path in tmp_path.glob("*.h5"):
-        recorded, followed = replayed(path, substeps)
-        assert recorded.tobytes() == followed.tobytes()
+        check_states_follow(path, substeps)
 
 
-# Something of every component that MuJoCo 3.3 knows, but plugins'.
+# Has every component of MuJoCo 3.3's states but plugins.
 EVERYTHING = """
 <mujoco>
   <size nuserdata="2"/>
@@ -105,8 +101,8 @@ def simulated():
     return model, read_state(model, data)
 
 
-def test_a_state_comes_back_by_the_names_of_its_parts():
-    """In the order in which another MuJoCo, with other bits, would write it."""
+def test_a_state_is_set_by_the_names_of_its_parts():
+    """A MuJoCo with other bits would write the parts in another order."""
     model, row = simulated()
     own = columns_of(state_dtype(model))
     names = list(reversed(own))
@@ -118,21 +114,21 @@ def test_a_state_comes_back_by_the_names_of_its_parts():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"act": None}, "act has 0, not 1 as in this model"),
         ({"qpos": slice(0, 9)}, "qpos has 9, not 8 as in this model"),
         ({"aura": slice(0, 1)}, r"aura, which MuJoCo .* lacks"),
     ],
 )
-def test_a_state_of_another_model_is_refused_whole(change, said):
-    """The message names what differs, and nothing is set."""
+def test_a_state_of_another_model_is_refused(change, message):
+    """The error names the difference, and nothing is set."""
     model, row = simulated()
     data = mujoco.MjData(model)
     before = read_state(model, data)
     own = columns_of(state_dtype(model))
     parts = {k: v for k, v in {**own, **change}.items() if v is not None}
-    with pytest.raises(InvalidArgument, match=said):
+    with pytest.raises(InvalidArgument, match=message):
         set_state(model, data, parts, np.append(row, 0.0))
     with pytest.raises(
         InvalidArgument, match=r"has \d+ numbers, but this array has the shape \(3,\)"

@@ -2,16 +2,15 @@
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
 import io
-import json
+import re
 import subprocess
 import sys
-import threading
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from browsers import barriers_of, chromium, complaints_of
+from browsers import barriers_of, chromium, complaints_of, data_of, served
 from parts import parametrize
 from PIL import Image
 from robots import robots_that_reset
@@ -25,11 +24,10 @@ pytest.importorskip("viser")
 pytest.importorskip("mjviser")
 from mjrec.viewing.episodes import recorded_episodes
 from mjrec.viewing.geometry import mesh_of
-from mjrec.viewing.live import LiveView
 from mjrec.viewing.motion import Shape
 
 _STEPS = 12
-# Meshes, skins, height fields, tendons, mocap bodies; hundreds of geoms.
+# They have meshes, skins, height fields, tendons, mocap bodies, hundreds of geoms.
 _ENVIRONMENTS = (
     *("FetchReach-v4", "dm_control/ball_in_cup-catch"),
     *("Humanoid-v5", "Ant-v5", "Pusher-v5", "FetchPickAndPlace-v4"),
@@ -38,7 +36,7 @@ _ENVIRONMENTS = (
     "dm_control/fish-swim",
 )
 
-# All shapes that are not geoms of one size: tendons around a cylinder, a cloth.
+# A tendon around a cylinder and a cloth change their shapes.
 _SOFT = """
 <mujoco>
   <worldbody>
@@ -69,7 +67,7 @@ _ROPE = """
 </mujoco>
 """
 
-# A hand that is moved from outside comes first, as in Fetch.
+# The mocap body comes first, as in Fetch.
 _PICKER = """
 <mujoco>
   <worldbody>
@@ -91,7 +89,7 @@ _BOX = """
 </mujoco>
 """
 
-# Where nodes of the scene are, in the frame of the model.
+# Returns the poses of the scene's nodes in the model's frame.
 _POSES = """() => {
   const nodes = window.__viserMutable.nodeRefFromName;
   const shown = Object.entries(nodes).filter(([name]) => name.startsWith("/"));
@@ -107,8 +105,8 @@ _VERTICES = """(name, kind = "position") => {
   return found;
 }"""
 _NORMALS = f"(name) => ({_VERTICES})(name, 'normal')"
-# What the page writes on its curve from now on.
-_NOTE_TEXT = """() => {
+# Collects the text that the page writes on its curve.
+_COLLECT_TEXT = """() => {
   window.drawnText = [];
   const context = CanvasRenderingContext2D.prototype, write = context.fillText;
   context.fillText = function (text, ...rest) {
@@ -140,7 +138,7 @@ _CAST_SHADOWS = """(casts) => {
   }
   window.__viserMutable.requestRender();
 }"""
-# Plays until a step is shown, and counts the images until then.
+# Plays until a step is shown, and counts the images.
 _IMAGES_UNTIL = f"""async (step) => {{
   document.getElementById("replay-play").click();
   let images = 0;
@@ -149,7 +147,7 @@ _IMAGES_UNTIL = f"""async (step) => {{
 }}"""
 _STEP_SHOWN = f"(step) => {_STEP} >= step"
 
-# An episode that goes on until the process is killed.
+# Records an endless episode.
 _RUN = """
 import sys, time, gymnasium, mjrec
 env = gymnasium.make("HalfCheetah-v5", max_episode_steps=10**6)
@@ -162,17 +160,17 @@ while True:
 
 
 def record(name, directory, steps=_STEPS, change=lambda env, step: None, **options):
-    """Record an episode without drawing it, and return its trajectory's path."""
+    """Record an episode without rendering it, and return its trajectory's path."""
     if name.startswith("dm_control/"):
         suite = pytest.importorskip("dm_control.suite")
         task = name.removeprefix("dm_control/").split("-")
         env = suite.load(*task, task_kwargs={"random": 0})
-        draw, begin, said = env.action_spec().generate_value, {}, {"env_id": name}
+        draw, begin, facts = env.action_spec().generate_value, {}, {"env_id": name}
     else:
         env = gymnasium.make(name, **options)
         env.action_space.seed(0)
-        draw, begin, said = env.action_space.sample, {"seed": 0}, {}
-    with mjrec.Monitor(env, directory, lambda _: True, workers=0, **said) as monitor:
+        draw, begin, facts = env.action_space.sample, {"seed": 0}, {}
+    with mjrec.Monitor(env, directory, lambda _: True, workers=0, **facts) as monitor:
         monitor.reset(**begin)
         for step in range(1, steps + 1):
             change(env, step)
@@ -181,9 +179,22 @@ def record(name, directory, steps=_STEPS, change=lambda env, step: None, **optio
     return path
 
 
+def record_any(name, directory, steps=_STEPS):
+    """Record an environment that may need Gymnasium-Robotics."""
+    with robots_that_reset():
+        if "/" not in name and name not in gymnasium.registry:
+            pytest.skip("Gymnasium-Robotics is not installed")
+        return record(name, directory, steps)
+
+
+def replay_of(path, directory):
+    """Write the replay of a recorded episode."""
+    return mjrec.write_replay(mjrec.load_trajectory(path), directory / "page.html")
+
+
 @pytest.fixture(scope="module")
 def cheetah(tmp_path_factory):
-    """Record a short episode that is cut by its time limit, its last state enlarged."""
+    """Record an episode that its time limit truncates; the last state zooms in."""
 
     def change(env, step):
         if step == _STEPS:
@@ -195,12 +206,12 @@ def cheetah(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pages():
-    """Yield what opens a page that must not fail, nor ask for anything but itself."""
+    """Yield a function that opens pages; they must not fail or load anything else."""
     complaints = []
     with chromium() as start:
 
         def opened(address):
-            # One for each page: they draw without a GPU, and would wait for each other.
+            # Pages of one browser would wait for each other, as they draw on the CPU.
             page = start().new_page(viewport={"width": 240, "height": 240})
             page.set_default_timeout(120_000)
             own = ("file:", "data:", "blob:", "http://127.0.0.1:")
@@ -210,14 +221,13 @@ def pages():
             return page
 
         yield opened
-    assert [each for said in complaints for each in said] == []
+    assert [each for found in complaints for each in found] == []
 
 
 @pytest.fixture(scope="module")
 def page(cheetah, pages, tmp_path_factory):
     """Open a replay of the cheetah at its seventh step."""
-    file = tmp_path_factory.mktemp("page") / "replay.html"
-    mjrec.write_replay(mjrec.load_trajectory(cheetah), file)
+    file = replay_of(cheetah, tmp_path_factory.mktemp("page")).path
     return pages(f"{file.as_uri()}#step=7&camera=track&speed=2")
 
 
@@ -232,21 +242,20 @@ def recorded_model(text, directory, *, steps):
 
 
 def data_at(trajectory, step):
-    """Return what MuJoCo computes from a recorded state."""
+    """Return MuJoCo's data of a recorded state."""
     data = mujoco.MjData(trajectory.model())
     trajectory.set_state(data, step)
     mujoco.mj_forward(data.model, data)
     return data
 
 
-def data_in(page):
-    """Return what a page's script reads."""
-    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
-    return json.loads(text)
+def numbers_in(text):
+    """Return the reward and the return that the page shows."""
+    return list(map(float, re.search(r"reward (.+?),.*return (\S+)", text).groups()))
 
 
 def check_geoms(page, data):
-    """Check that the page has the geoms that MuJoCo draws, where MuJoCo has them."""
+    """Check that the page shows the geoms that MuJoCo draws, at the same poses."""
     page.wait_for_timeout(500)
     poses = {k: v for k, v in page.evaluate(_POSES).items() if k.startswith("/geom/")}
     scene = mujoco.MjvScene(data.model, maxgeom=10_000)
@@ -273,31 +282,22 @@ def check_geoms(page, data):
 
 @pytest.mark.browser
 @parametrize("name", _ENVIRONMENTS, default=2, part=pytest.mark.environments)
-def test_all_kinds_of_scenes_stand_where_mujoco_has_them(name, pages, tmp_path):
-    """So do meshes, skins, height fields, and bodies that the simulation moves.
-
-    A browser draws each without a GPU, which takes more than five seconds.
-    """
-    with robots_that_reset():
-        if "/" not in name and name not in gymnasium.registry:
-            pytest.skip("Gymnasium-Robotics is not installed")
-        path = record(name, tmp_path / "run")
-    trajectory = mjrec.load_trajectory(path)
-    mjrec.write_replay(trajectory, tmp_path / "page.html")
-    page = pages(f"{(tmp_path / 'page.html').as_uri()}#step={_STEPS}")
-    check_geoms(page, data_at(trajectory, _STEPS))
-    shown = data_in(tmp_path / "page.html")
+def test_geoms_skins_and_free_cameras_are_where_mujoco_has_them(name, pages, tmp_path):
+    """Takes more than five seconds, as the browser draws without a GPU."""
+    path = record_any(name, tmp_path / "run")
+    file = replay_of(path, tmp_path).path
+    page = pages(f"{file.as_uri()}#step={_STEPS}")
+    check_geoms(page, data_at(mjrec.load_trajectory(path), _STEPS))
+    shown = data_of(file.read_text())
     if shown["camera"] == "free":
-        # It stands where the environment has put it, as in the videos.
         position, _ = page.evaluate(_CAMERA)
         assert position == pytest.approx(shown["view"]["position"], abs=1e-4)
 
 
 @pytest.mark.browser
-def test_keys_go_through_the_states(page, cheetah):
-    """Steps, their rewards and the end are shown; the address keeps the place."""
+def test_keys_move_through_the_states(page, cheetah):
+    """The page starts at the state in its URL and shows rewards and ending."""
     trajectory = mjrec.load_trajectory(cheetah)
-    # It begins at the state that its address names.
     check_geoms(page, data_at(trajectory, 7))
     page.keyboard.press("Home")
     assert "step 0 of 12" in page.inner_text("#replay-where")
@@ -306,10 +306,8 @@ def test_keys_go_through_the_states(page, cheetah):
     page.keyboard.press(".")
     where = page.inner_text("#replay-where")
     assert "step 2 of 12, 0.10 s" in where
-    reward = float(where.split("reward ")[1].split(",")[0])
-    assert reward == pytest.approx(trajectory.rewards[1], rel=1e-3)
-    returned = float(where.split("return ")[1])
-    assert returned == pytest.approx(trajectory.rewards[:2].sum(), rel=1e-3)
+    rewards = trajectory.rewards[:2]
+    assert numbers_in(where) == pytest.approx([rewards[1], rewards.sum()], rel=1e-3)
     page.keyboard.press("End")
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
@@ -317,8 +315,8 @@ def test_keys_go_through_the_states(page, cheetah):
 
 
 @pytest.mark.browser
-def test_a_camera_of_the_model_is_kept_from_step_to_step(page, cheetah):
-    """It moves and zooms as in the videos, also if it is named like one of the page."""
+def test_a_model_camera_moves_and_zooms_as_in_videos(page, cheetah):
+    """This camera has the same name as one of the page's own cameras."""
     trajectory = mjrec.load_trajectory(cheetah)
     page.keyboard.press("End")
     page.select_option("#replay-camera", label="track")
@@ -333,8 +331,7 @@ def test_a_camera_of_the_model_is_kept_from_step_to_step(page, cheetah):
 
 
 @pytest.mark.browser
-def test_dragging_turns_the_free_camera_only(page):
-    """It turns around what it looks at; a camera of the model stays in its place."""
+def test_dragging_orbits_only_the_free_camera(page):
     page.set_viewport_size({"width": 240, "height": 400})
     canvas = page.locator("#root canvas").first.bounding_box()
     x, y = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
@@ -348,14 +345,14 @@ def test_dragging_turns_the_free_camera_only(page):
         page.evaluate(_AFTER_FRAMES, 10)
         after, _ = page.evaluate(_CAMERA)
         assert (np.linalg.norm(np.subtract(after, before)) > 0.5) == turns
-    # It went around, neither up nor nearer.
+    # The height is the same.
     assert after[2] == pytest.approx(before[2], abs=0.01)
     page.select_option("#replay-camera", label="tracking")
 
 
 @pytest.mark.browser
 def test_bodies_cast_a_shadow_on_the_floor(page):
-    """Places of the gray floor are darker than without the shadows of the bodies."""
+    """Parts of the gray floor are darker than without shadows."""
     page.set_viewport_size({"width": 240, "height": 400})
     page.keyboard.press("Home")
     page.select_option("#replay-camera", label="track")
@@ -373,8 +370,7 @@ def test_bodies_cast_a_shadow_on_the_floor(page):
 
 
 @pytest.mark.browser
-def test_the_slider_scrubs(page, cheetah):
-    """Dragging it to its middle shows the state in the middle."""
+def test_dragging_the_slider_to_its_middle_shows_the_middle_state(page, cheetah):
     page.keyboard.press("Home")
     place = page.locator("#replay-place").bounding_box()
     y = place["y"] + place["height"] / 2
@@ -388,11 +384,10 @@ def test_the_slider_scrubs(page, cheetah):
 
 
 @pytest.mark.browser
-def test_the_chosen_speed_plays_faster(page):
-    """At four times the speed, each image is at least a step on; at a tenth, it isn't.
+def test_a_higher_speed_takes_fewer_images(page):
+    """At four times the speed, each image moves on by a step or more.
 
-    However slow the machine is, the page goes on by at most a quarter of a second
-    between two images.
+    Even on a slow machine, an image moves on by at most a quarter of a second.
     """
     images = {}
     for speed in ("4", "0.1"):
@@ -404,8 +399,7 @@ def test_the_chosen_speed_plays_faster(page):
 
 
 @pytest.mark.browser
-def test_speeds_end_at_the_slowest_and_the_fastest(page):
-    """Keys beyond the ends change nothing."""
+def test_speed_keys_stop_at_the_slowest_and_the_fastest(page):
     for key, speed in (("]", "4"), ("[", "0.1")):
         for _ in range(8):
             page.keyboard.press(key)
@@ -413,27 +407,25 @@ def test_speeds_end_at_the_slowest_and_the_fastest(page):
 
 
 @pytest.mark.browser
-def test_the_curve_tells_the_step_under_the_cursor(page, cheetah):
-    """Pointing shows a step's reward and return, a click goes to it."""
+def test_the_curve_shows_the_step_under_the_cursor_and_a_click_goes_to_it(
+    page, cheetah
+):
     rewards = mjrec.load_trajectory(cheetah).rewards
-    page.evaluate(_NOTE_TEXT)
+    page.evaluate(_COLLECT_TEXT)
     curve = page.locator("#replay-curve")
     width = curve.bounding_box()["width"]
     place = {"x": width * 3 / _STEPS, "y": 5}
     curve.hover(position=place)
-    told = page.evaluate("window.drawnText")[-1]
-    assert "step 3 of 12" in told
-    assert float(told.split("reward ")[1].split(",")[0]) == pytest.approx(
-        rewards[2], rel=1e-3
-    )
-    assert float(told.split("return ")[1]) == pytest.approx(rewards[:3].sum(), rel=1e-3)
+    text = page.evaluate("window.drawnText")[-1]
+    assert "step 3 of 12" in text
+    assert numbers_in(text) == pytest.approx([rewards[2], rewards[:3].sum()], rel=1e-3)
     curve.click(position=place)
-    assert page.inner_text("#replay-where") == told
+    assert page.inner_text("#replay-where") == text
 
 
 @pytest.mark.browser
-def test_it_plays_and_pauses(page):
-    """Space plays from the reset and pauses; playing stops at the last state."""
+def test_space_plays_and_pauses(page):
+    """Playing begins at the reset and stops at the last state."""
     page.keyboard.press("End")
     page.evaluate("document.getElementById('replay-speed').value = '0.1'")
     page.keyboard.press(" ")
@@ -449,8 +441,7 @@ def test_it_plays_and_pauses(page):
 
 @pytest.mark.browser
 @pytest.mark.axe
-def test_nothing_keeps_people_out_of_a_replay(page):
-    """Axe finds nothing serious in the controls, with the keys shown."""
+def test_controls_and_help_are_accessible(page):
     page.keyboard.press("?")
     found = barriers_of(page, context=[["#replay"], ["#replay-keys"]])
     page.keyboard.press("Escape")
@@ -459,34 +450,28 @@ def test_nothing_keeps_people_out_of_a_replay(page):
 
 @pytest.mark.browser
 @pytest.mark.thorough
-def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
-    """A page shows the newest states of another process, and all that a kill leaves."""
-    run = subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path)])
-    thread = None
-    try:
-        wait_until(lambda: len(list(tmp_path.glob("*.log"))) > 0)
-        view = LiveView(tmp_path)
-        thread = threading.Thread(target=view.serve)
-        thread.start()
-        page = pages(view.url)
-        page.wait_for_function(_STEP_SHOWN, arg=1)
-        page.wait_for_function(_STEP_SHOWN, arg=page.evaluate(_STEP) + 1)
-        run.kill()
-        run.wait()
-        [path] = recorded_episodes(tmp_path)
-        last = len(mjrec.load_trajectory(path))
-        page.wait_for_function(_STEP_SHOWN, arg=last)
-    finally:
-        run.kill()
-        run.wait()
-        if thread is not None:
-            view.close()
-            thread.join()
+def test_the_live_view_follows_another_process_and_keeps_all_that_a_kill_leaves(
+    pages, tmp_path
+):
+    with subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path)]) as run:
+        try:
+            wait_until(lambda: len(list(tmp_path.glob("*.log"))) > 0)
+            with served(tmp_path) as view:
+                page = pages(view.url)
+                page.wait_for_function(_STEP_SHOWN, arg=1)
+                page.wait_for_function(_STEP_SHOWN, arg=page.evaluate(_STEP) + 1)
+                run.kill()
+                run.wait()
+                [path] = recorded_episodes(tmp_path)
+                last = len(mjrec.load_trajectory(path))
+                page.wait_for_function(_STEP_SHOWN, arg=last)
+        finally:
+            run.kill()
 
 
 @pytest.mark.browser
-def test_a_chosen_episode_is_shown_with_its_shapes_and_its_name(pages, tmp_path):
-    """Also if the page is loaded again for other shapes: it does not jump back."""
+def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
+    """It does not jump back, even if the page reloads for other geom sizes."""
     env = gymnasium.make("Hopper-v5", max_episode_steps=2)
     with mjrec.Monitor(env, tmp_path, lambda _: True, workers=0) as run:
         for radius in (0.05, 0.2):
@@ -494,32 +479,25 @@ def test_a_chosen_episode_is_shown_with_its_shapes_and_its_name(pages, tmp_path)
             run.reset(seed=0)
             run.step(np.zeros(3))
             run.step(np.zeros(3))
-    with LiveView(tmp_path) as view:
-        thread = threading.Thread(target=view.serve)
-        thread.start()
-        try:
-            page = pages(view.url)
-            for number, width in ((1, 0.4), (0, 0.1)):
-                button = page.locator(f"#live-episodes button:text('{number}: 2')")
-                # A click would wait for a list that is not replaced meanwhile.
-                button.dispatch_event("click")
-                title = f"Hopper-v5, episode {number}"
-                page.wait_for_function("(said) => document.title === said", arg=title)
-                page.wait_for_selector("html[data-replay=ready]", state="attached")
-                page.wait_for_selector("#live-episodes [aria-pressed=true]")
-                assert f"{title}: recorded" in page.inner_text("#replay")
-                shown = np.reshape(page.evaluate(_VERTICES, "/geom/2"), (-1, 3))
-                assert np.ptp(shown, axis=0).min() == pytest.approx(width, rel=0.1)
-                assert page.inner_text("#live-count") == "Complete episodes: 2"
-        finally:
-            view.close()
-            thread.join()
+    with served(tmp_path) as view:
+        page = pages(view.url)
+        for number, width in ((1, 0.4), (0, 0.1)):
+            button = page.locator(f"#live-episodes button:text('{number}: 2')")
+            # A click would wait until the list is not replaced.
+            button.dispatch_event("click")
+            title = f"Hopper-v5, episode {number}"
+            page.wait_for_function("(title) => document.title === title", arg=title)
+            page.wait_for_selector("html[data-replay=ready]", state="attached")
+            page.wait_for_selector("#live-episodes [aria-pressed=true]")
+            assert f"{title}: recorded" in page.inner_text("#replay")
+            shown = np.reshape(page.evaluate(_VERTICES, "/geom/2"), (-1, 3))
+            assert np.ptp(shown, axis=0).min() == pytest.approx(width, rel=0.1)
+            assert page.inner_text("#live-count") == "Complete episodes: 2"
 
 
 @pytest.mark.browser
 @pytest.mark.thorough
-def test_tendons_and_cloth_move(pages, tmp_path):
-    """What changes its shape has the vertices and the segments that MuJoCo computes."""
+def test_tendons_and_cloth_have_the_shapes_that_mujoco_computes(pages, tmp_path):
     trajectory = recorded_model(_SOFT, tmp_path, steps=8)
     file = tmp_path / "replay.html"
     assert mjrec.write_replay(trajectory, file).notes == ()
@@ -533,10 +511,10 @@ def test_tendons_and_cloth_move(pages, tmp_path):
     assert normals == pytest.approx(np.tile([0, 0, 1], (16, 1)), abs=1e-5)
     segments = [n for n in page.evaluate(_POSES) if n.startswith("/tendon/")]
     sizes = np.array(page.evaluate(_SIZES, segments))
-    is_there = sizes[:, 2] > 1e-6
-    # The tendon has fewer segments here than in another state.
-    assert 2 <= is_there.sum() < len(segments)
-    assert sizes[is_there, 0] == pytest.approx(0.01)
+    is_shown = sizes[:, 2] > 1e-6
+    # The tendon has more segments in other states.
+    assert 2 <= is_shown.sum() < len(segments)
+    assert sizes[is_shown, 0] == pytest.approx(0.01)
     assert sizes.max() < 1
 
 
@@ -552,97 +530,108 @@ def test_tendons_and_cloth_move(pages, tmp_path):
     ],
     default=2,
 )
-def test_replays_are_small(name, steps, largest, tmp_path):
-    """A replay has all recorded states; a thousand of Humanoid's take at most 5 MB."""
+def test_a_replay_of_all_states_is_small(name, steps, largest, tmp_path):
     options = {"terminate_when_unhealthy": False} if steps == 999 else {}
-    path = record(name, tmp_path / "run", steps, **options)
-    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    made = replay_of(record(name, tmp_path / "run", steps, **options), tmp_path)
     assert made.states == steps + 1
     assert 500_000 < made.size == made.path.stat().st_size < largest
 
 
-def test_the_command_writes_an_episode_of_a_directory(cheetah, tmp_path, capsys):
-    """`mjrec replay DIR --episode N` takes an episode by its number, at a rate."""
+def test_the_command_writes_the_episode_of_a_number(cheetah, tmp_path, capsys):
     page = tmp_path / "page.html"
     options = ["--episode", "0", "--max-fps", "5", "--out", str(page)]
     assert main(["replay", str(cheetah.parent), *options]) == 0
-    # Every fourth of 13 states, at twenty a second.
+    # Every fourth of 13 states at 20 Hz.
     assert capsys.readouterr().out.startswith(f"{page}: 4 states, ")
     assert main(["replay", str(cheetah.parent), "--episode", "3"]) == 1
     assert "Available: 0." in capsys.readouterr().err
 
 
-def test_what_cannot_be_shown_is_left_out(cheetah, tmp_path):
-    """A state that is no numbers, as after a reset; a name that is code is text."""
+def test_states_that_are_not_finite_are_left_out(cheetah, tmp_path):
+    """Without any finite state, nothing is written."""
     trajectory = mjrec.load_trajectory(cheetah)
-    trajectory.facts = {**trajectory.facts, "env_id": "</script><script>alert(1)"}
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
     assert made.notes == ("States left out because they are not finite: 1 of 13.",)
+    trajectory.states[:] = np.nan
+    with pytest.raises(UnreadableFile, match="none of the states to show is finite"):
+        mjrec.write_replay(trajectory, tmp_path / "page.html")
+
+
+def test_an_environment_name_cannot_run_code(cheetah, tmp_path):
+    trajectory = mjrec.load_trajectory(cheetah)
+    trajectory.facts = {**trajectory.facts, "env_id": "</script><script>alert(1)"}
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert "<script>alert" not in made.path.read_text()
 
 
-def test_colours_change_when_the_model_does(tmp_path):
-    """A geom has the colour that it had in each state; one that vanishes is hidden."""
-
-    def change(env, step):
-        if step == 3:
-            env.unwrapped.model.geom_rgba[2] = (1, 0, 0, 1)
-            env.unwrapped.model.geom_rgba[3, 3] = 0
-
-    path = record("Hopper-v5", tmp_path, 4, change)
-    page = tmp_path / "page.html"
-    mjrec.write_replay(mjrec.load_trajectory(path), page)
-    colours = {each[1]: each for each in data_in(page)["chunk"]["colours"]}
-    assert colours["/geom/2"] == [3, "/geom/2", [1, 0, 0, 1]]
-    assert colours["/geom/3"][0] == 3
-    assert colours["/geom/3"][2][3] == 0
-
-
-def test_the_view_follows_what_joints_move(tmp_path):
-    """It is the first tree with a joint, not a mocap body that comes before it."""
-    trajectory = recorded_model(_PICKER, tmp_path, steps=2)
-    page = mjrec.write_replay(trajectory, tmp_path / "page.html").path
-    centre = data_at(trajectory, 0).body("arm").subtree_com
-    assert data_in(page)["start"] == pytest.approx(centre)
-
-
-def test_what_appears_later_is_there_hidden(tmp_path):
-    """A geom that the first state does not show is part of the page."""
+def test_geoms_change_color_appear_and_vanish_as_in_the_model(tmp_path):
+    """A geom that appears later is hidden at first."""
 
     def change(env, step):
         env.unwrapped.model.geom_rgba[2] = (1, 0, 0, step > 2)
+        if step == 3:
+            env.unwrapped.model.geom_rgba[3] = (0, 1, 0, 1)
+            env.unwrapped.model.geom_rgba[4, 3] = 0
 
     trajectory = mjrec.load_trajectory(record("Hopper-v5", tmp_path, 4, change))
+    # Without the reset's state, geom 2 is invisible at first.
     trajectory.states[0] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.notes == ("States left out because they are not finite: 1 of 5.",)
-    data = data_in(tmp_path / "page.html")
+    data = data_of(made.path.read_text())
     assert data["rgba"]["/geom/2"][3] == 0
-    assert data["chunk"]["colours"] == [[2, "/geom/2", [1, 0, 0, 1]]]
+    changes = {name: (at, rgba) for at, name, rgba in data["chunk"]["colours"]}
+    assert len(changes) == len(data["chunk"]["colours"]) == 3
+    assert changes["/geom/2"] == (2, [1, 0, 0, 1])
+    assert changes["/geom/3"] == (2, [0, 1, 0, 1])
+    assert (changes["/geom/4"][0], changes["/geom/4"][1][3]) == (2, 0)
+
+
+def test_the_view_follows_the_first_tree_with_a_joint(tmp_path):
+    """A mocap body before it does not count."""
+    trajectory = recorded_model(_PICKER, tmp_path, steps=2)
+    page = mjrec.write_replay(trajectory, tmp_path / "page.html").path
+    centre = data_at(trajectory, 0).body("arm").subtree_com
+    assert data_of(page.read_text())["start"] == pytest.approx(centre)
+
+
+def check_note(made, note, caplog):
+    """Check that the result, the log and the page have a note."""
+    assert made.notes == (note,)
+    assert note in caplog.text
+    assert f"<p>{note}</p>" in made.path.read_text()
 
 
 @pytest.mark.parametrize(
     ("field", "kind"),
     [("geom_size", "Sizes and meshes"), ("mat_texrepeat", "Textures")],
 )
-def test_changes_that_are_not_shown_are_named(field, kind, tmp_path, caplog):
-    """Shapes and their images stay as at the reset; the page and the log say so."""
-
+def test_a_note_names_changes_that_are_not_shown(field, kind, tmp_path, caplog):
     def change(env, step):
         if step == 2:
             getattr(env.unwrapped.model, field)[:] *= 2
 
-    path = record("Hopper-v5", tmp_path, 4, change)
-    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
-    assert made.notes == (f"{kind} change during the episode but not on this page.",)
-    assert made.notes[0] in caplog.text
-    assert f"<p>{made.notes[0]}</p>" in made.path.read_text()
+    made = replay_of(record("Hopper-v5", tmp_path, 4, change), tmp_path)
+    check_note(made, f"{kind} change during the episode but not on this page.", caplog)
 
 
-def test_sides_have_the_whole_texture_and_normals(tmp_path):
-    """One image for all sides is not cut into six; round shapes look smooth."""
+def test_a_note_says_that_ropes_are_not_shown(tmp_path, caplog):
+    trajectory = recorded_model(_ROPE, tmp_path, steps=2)
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
+    check_note(made, "One-dimensional flexible bodies are not shown.", caplog)
+
+
+def test_a_note_says_that_videos_show_objects_elsewhere(tmp_path):
+    """For a video, the environment puts a hand's goal, which falls, in its place."""
+    path = record_any("HandManipulateBlock-v1", tmp_path / "run", 1)
+    [note] = replay_of(path, tmp_path).notes
+    assert note.startswith("The videos show some objects in other places")
+
+
+def test_sides_of_a_cube_have_the_whole_texture_and_smooth_normals(tmp_path):
+    """An image for all sides is not cut into six."""
     Image.new("RGB", (8, 8), "red").save(tmp_path / "side.png")
     path = tmp_path / "box.xml"
     path.write_text(_BOX)
@@ -652,31 +641,3 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
     assert b"NORMAL" in mesh.export(file_type="glb")
     top = mesh.vertex_normals[:, 2] > 0.9
     assert np.ptp(mesh.visual.uv[top], axis=0) == pytest.approx([1, 1])
-
-
-def test_what_only_the_videos_show_elsewhere_is_named(tmp_path):
-    """A hand's goal, which falls in the states, is put in its place to be drawn."""
-    with robots_that_reset():
-        if "HandManipulateBlock-v1" not in gymnasium.registry:
-            pytest.skip("Gymnasium-Robotics is not installed")
-        path = record("HandManipulateBlock-v1", tmp_path / "run", 1)
-    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
-    [note] = made.notes
-    assert note.startswith("The videos show some objects in other places")
-
-
-def test_an_episode_without_finite_states_is_refused(cheetah, tmp_path):
-    """The error names the file and says why there is nothing to show."""
-    trajectory = mjrec.load_trajectory(cheetah)
-    trajectory.states[:] = np.nan
-    with pytest.raises(UnreadableFile, match="none of the states to show is finite"):
-        mjrec.write_replay(trajectory, tmp_path / "page.html")
-
-
-def test_the_page_says_what_it_does_not_show(tmp_path, caplog):
-    """A rope has no surface; the result, the log and the page say so."""
-    trajectory = recorded_model(_ROPE, tmp_path, steps=2)
-    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
-    assert made.notes == ("One-dimensional flexible bodies are not shown.",)
-    assert made.notes[0] in caplog.text
-    assert f"<p>{made.notes[0]}</p>" in made.path.read_text()

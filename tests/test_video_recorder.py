@@ -28,7 +28,7 @@ def record(recorder, env, steps):
 
 
 class Frames:
-    """Gives a list of things as frames."""
+    """Renders the given frames, or raises where one is an exception."""
 
     render_mode = "rgb_array"
 
@@ -43,7 +43,7 @@ class Frames:
         return frame
 
 
-def grey(brightness=90):
+def gray(brightness=90):
     return np.full((8, 10, 3), brightness, np.uint8)
 
 
@@ -53,7 +53,7 @@ def path(tmp_path):
 
 
 def test_every_capture_is_a_frame(corridor, path):
-    """The reset's and the last one are in the file, in order; nothing comes later."""
+    """Captures after `close` are ignored."""
     given = {"episode_id": 1}
     recorder = VideoRecorder(corridor, path, given)
     metadata = record(recorder, corridor, 3)
@@ -64,7 +64,7 @@ def test_every_capture_is_a_frame(corridor, path):
     assert (metadata["frame_count"], metadata["frame_steps"]) == (4, [[0, 3]])
     assert metadata["content_type"] == "video/mp4"
     assert (recorder.functional, recorder.empty) == (True, False)
-    # gym's keys; no absolute path that a move makes stale.
+    # These are gym's keys; an absolute path would not survive a move.
     encoder = metadata["encoder_version"]
     assert encoder["backend"] == "ffmpeg"
     assert encoder["version"].startswith("ffmpeg version")
@@ -73,7 +73,7 @@ def test_every_capture_is_a_frame(corridor, path):
 
 
 class Repeat(gymnasium.Wrapper):
-    """Repeats actions, which makes the step longer, whatever is declared."""
+    """Repeats actions, so that a step takes longer than the environment declares."""
 
     def step(self, action):
         self.env.step(action)
@@ -86,14 +86,13 @@ class Repeat(gymnasium.Wrapper):
         ("HalfCheetah-v5", None, {}, "20", 1.0),
         ("HalfCheetah-v5", Repeat, {}, "10", 1.0),
         ("Humanoid-v5", None, {}, "200/3", 1.0),
-        # `fps` is written, and selects no frames.
+        # `fps` sets the file's rate and keeps all frames.
         ("HalfCheetah-v5", None, {"fps": 10}, "10", 0.5),
     ],
 )
-def test_rate_is_the_simulated_time_of_a_step(
+def test_the_file_has_the_exact_rate_of_simulated_steps(
     *, env_id, wrapper, options, fps, speed, path
 ):
-    """Exact, also in the file."""
     env = gymnasium.make(env_id, render_mode="rgb_array", width=32, height=32)
     env = wrapper(env) if wrapper else env
     recorder = VideoRecorder(env, path, **options)
@@ -108,9 +107,9 @@ def test_rate_is_the_simulated_time_of_a_step(
 
 
 @pytest.mark.parametrize(("declared", "fps"), [({"render_fps": 10}, "10"), ({}, "30")])
-def test_rate_without_simulation_is_the_declared_one(path, declared, fps, caplog):
-    """Also of a single frame; where none is, a warning names the argument for it."""
-    with VideoRecorder(Frames(grey(), **declared), path) as recorder:
+def test_without_a_simulation_the_declared_rate_is_used(path, declared, fps, caplog):
+    """Without a declared rate, a warning names the argument."""
+    with VideoRecorder(Frames(gray(), **declared), path) as recorder:
         recorder.capture_frame()
     assert recorder.finished
     assert metadata_of(recorder)["fps"] == fps
@@ -118,12 +117,11 @@ def test_rate_without_simulation_is_the_declared_one(path, declared, fps, caplog
     assert ("fps=" in caplog.text) is (not declared)
 
 
-def test_a_frame_list_is_drained_in_order(make_corridor, path):
-    """All the frames of a step are recorded, and the rate fits them."""
+def test_all_frames_of_a_list_are_recorded_at_a_rate_that_fits(make_corridor, path):
     env = make_corridor(render_mode="rgb_array_list")
-    # Three frames for each tenth of a second.
+    # There are three frames for each tenth of a second.
     times, shown = iter([0.0, 0.1, 0.2]), iter(range(1, 10))
-    env.render = lambda: [grey(25 * next(shown)) for _ in range(3)]
+    env.render = lambda: [gray(25 * next(shown)) for _ in range(3)]
     recorder = VideoRecorder(env, path, clock=lambda: next(times))
     metadata = record(recorder, env, 2)
     recorded = [round(float(frame.mean()) / 25) for frame in frames_of(recorder.path)]
@@ -134,8 +132,7 @@ def test_a_frame_list_is_drained_in_order(make_corridor, path):
     assert metadata["playback_speed"] == 1.0
 
 
-def test_a_text_environment_becomes_an_asciicast(make_corridor, tmp_path):
-    """Frames of the mode ansi are text, shown at the declared rate."""
+def test_ansi_frames_become_an_asciicast_at_the_declared_rate(make_corridor, tmp_path):
     env = make_corridor(render_mode="ansi")
     recorder = VideoRecorder(env, base_path=tmp_path / "v")
     metadata = record(recorder, env, 2)
@@ -148,8 +145,10 @@ def test_a_text_environment_becomes_an_asciicast(make_corridor, tmp_path):
 
 
 @pytest.mark.parametrize(("mode", "enabled"), [("human", True), ("rgb_array", False)])
-def test_a_recorder_without_frames_does_nothing(make_corridor, path, mode, enabled):
-    """It leaves nothing, as in gym; none is drawn where it is not enabled."""
+def test_a_recorder_of_other_modes_or_disabled_does_nothing(
+    make_corridor, path, mode, enabled
+):
+    """It renders and writes nothing, as in gym."""
     env = make_corridor(render_mode=mode)
     recorder = VideoRecorder(env, path, enabled=enabled)
     recorder.capture_frame()
@@ -168,9 +167,11 @@ def test_a_recorder_without_frames_does_nothing(make_corridor, path, mode, enabl
         (np.zeros((8, 12, 3), np.uint8), "the same size"),
     ],
 )
-def test_a_bad_frame_keeps_the_good_ones(path, bad, reason, caplog):
-    """The video ends there, playable; one warning and the metadata say why."""
-    recorder = VideoRecorder(Frames(grey(), grey(120), bad, grey(), bad), path)
+def test_a_bad_frame_ends_the_video_and_keeps_the_frames_before(
+    path, bad, reason, caplog
+):
+    """There is one warning with the reason, and the metadata say that it is broken."""
+    recorder = VideoRecorder(Frames(gray(), gray(120), bad, gray(), bad), path)
     for _ in range(5):
         recorder.capture_frame()
     recorder.close()
@@ -178,12 +179,12 @@ def test_a_bad_frame_keeps_the_good_ones(path, bad, reason, caplog):
     assert not recorder.functional
     assert len(frames_of(recorder.path)) == 2
     assert metadata_of(recorder)["broken"] is True
-    [said] = [t for r in caplog.records if "was bad" in (t := r.getMessage())]
-    assert re.search(reason, said)
+    [warning] = [t for r in caplog.records if "was bad" in (t := r.getMessage())]
+    assert re.search(reason, warning)
 
 
-def test_without_a_frame_there_is_only_metadata(path):
-    """An error of render() is raised unchanged, and breaks nothing."""
+def test_without_frames_only_metadata_are_written(path):
+    """An error of `render` is raised unchanged and does not count as broken."""
     recorder = VideoRecorder(Frames(RuntimeError("no GL")), path, {"episode_id": 3})
     with pytest.raises(RuntimeError, match="no GL"):
         recorder.capture_frame()
@@ -199,7 +200,7 @@ def test_without_a_frame_there_is_only_metadata(path):
 
 
 @pytest.mark.parametrize(
-    ("mode", "options", "words"),
+    ("mode", "options", "message"),
     [
         ("rgb_array", {"path": "v.mp4", "fps": 0}, "fps must be"),
         ("rgb_array", {"path": "v.mp4", "base_path": "v"}, "not both"),
@@ -207,16 +208,13 @@ def test_without_a_frame_there_is_only_metadata(path):
         ("ansi", {"path": "v.mp4"}, r"end in \.json"),
     ],
 )
-def test_impossible_options_are_an_error(make_corridor, mode, options, words):
-    """At construction, before anything is written."""
-    with pytest.raises(InvalidArgument, match=words):
+def test_the_constructor_refuses_wrong_options(make_corridor, mode, options, message):
+    with pytest.raises(InvalidArgument, match=message):
         VideoRecorder(make_corridor(render_mode=mode), **options)
 
 
-def test_a_relative_path_is_fixed_and_a_missing_one_is_made(
-    corridor, tmp_path, monkeypatch
-):
-    """A later chdir parts nothing; without a path it is in a new directory."""
+def test_changing_directory_moves_no_output(corridor, tmp_path, monkeypatch):
+    """Without a path, the video is in a new directory."""
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
     recorder = VideoRecorder(corridor, "v.mp4")

@@ -6,8 +6,8 @@ import time
 _MOMENT = 0.01
 
 
-def wait_until(holds, *, seconds=30, told=lambda: "it has not come to hold"):
-    """Poll until `holds()`; fail with `told()` after far longer than it takes."""
+def wait_until(holds, *, seconds=30, told=lambda: "the condition never held"):
+    """Poll until `holds()`; after `seconds`, fail with the message `told()`."""
     deadline = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < deadline, told()
