@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
+import contextlib
 import io
 import re
 import subprocess
@@ -205,14 +206,23 @@ def cheetah(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pages():
+def start():
+    with chromium() as start:
+        yield start
+
+
+@contextlib.contextmanager
+def page_opener(start):
     """Yield a function that opens pages; they must not fail or load anything else."""
     complaints = []
-    with chromium() as start:
+    # A page that stays open keeps rendering on the CPU.
+    with contextlib.ExitStack() as browsers:
 
         def opened(address):
-            # Pages of one browser would wait for each other, as they draw on the CPU.
-            page = start().new_page(viewport={"width": 240, "height": 240})
+            # Pages of one browser would wait for each other.
+            browser = start()
+            browsers.callback(browser.close)
+            page = browser.new_page(viewport={"width": 240, "height": 240})
             page.set_default_timeout(120_000)
             own = ("file:", "data:", "blob:", "http://127.0.0.1:")
             complaints.append(complaints_of(page, own))
@@ -224,11 +234,18 @@ def pages():
     assert [each for found in complaints for each in found] == []
 
 
+@pytest.fixture
+def pages(start):
+    with page_opener(start) as opened:
+        yield opened
+
+
 @pytest.fixture(scope="module")
-def page(cheetah, pages, tmp_path_factory):
+def page(cheetah, start, tmp_path_factory):
     """Open a replay of the cheetah at its seventh step."""
     file = replay_of(cheetah, tmp_path_factory.mktemp("page")).path
-    return pages(f"{file.as_uri()}#step=7&camera=track&speed=2")
+    with page_opener(start) as opened:
+        yield opened(f"{file.as_uri()}#step=7&camera=track&speed=2")
 
 
 def recorded_model(text, directory, *, steps):

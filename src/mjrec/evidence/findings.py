@@ -181,7 +181,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether everything was recreated and is equal or allowed."""
+        """Whether everything was recreated and matches or is allowed."""
         return self.verdict is Verdict.PASS
 
     @property
