@@ -94,12 +94,9 @@ def write_evaluation(
 
 
 def _entry(result):
-    return entry(
-        result.episode_id,
-        reward=result.total_reward,
-        seed=result.seed,
-        evaluation={"seed": result.seed, "episode": result.episode},
-    )
+    unit = {"seed": result.seed, "episode": result.episode}
+    reward = result.total_reward
+    return entry(result.episode_id, reward=reward, seed=result.seed, evaluation=unit)
 
 
 def _result(task, seed, number, total, monitor, episode_id):
