@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests do with a run, on whichever engine."""
+"""Runs of `odd_jobs` on engines, and the processes that they start."""
 
 import contextlib
 import functools
@@ -20,13 +20,13 @@ from mjrec.engines.local import LocalEngine
 from mjrec.engines.ray import RayEngine
 from mjrec.engines.slurm import SlurmEngine
 
-# An environment variable, by which a test finds what it has started.
+# This environment variable marks the processes that a test has started.
 MARK = "MJREC_TEST_MARK"
 
 
 @contextlib.contextmanager
 def each_engine(home):
-    """Have what makes engines by kind and number of workers; clusters start once."""
+    """Yield a function from kind and workers to an engine; clusters start once."""
     from ray_clusters import home_for_ray, own_ray
 
     with contextlib.ExitStack() as clusters:
@@ -65,25 +65,25 @@ def odd_work(make="make", *, shared=None, **settings):
 
 
 def submit(run, *jobs, **arguments):
-    """Hand out jobs that differ in nothing but their keys."""
+    """Submit jobs with the same arguments."""
     for key in jobs:
         run.submit(key, **arguments)
 
 
 def outcomes(run):
-    """Return what becomes of all jobs, in the order in which it comes."""
+    """Return the outcomes of all jobs by key, in order of completion."""
     return {outcome.key: outcome for outcome in run.results() if outcome is not None}
 
 
 def values(run):
-    """Return what the handlers return; no job may fail."""
+    """Return the values of all jobs, none of which may fail."""
     found = outcomes(run).values()
     assert not [outcome.failure for outcome in found if outcome.failure]
     return [dict(outcome.value or {}) for outcome in found]
 
 
 def wait_for(path, run):
-    """Return the number of the process that has begun a job, which notes it there."""
+    """Return the process id that a job writes to `path` when it starts."""
     for _ in run.results(timeout_s=0.02):
         if path.exists() and path.read_text():
             break
@@ -91,10 +91,9 @@ def wait_for(path, run):
 
 
 def marked(mark):
-    """Return the commands of other processes in whose environment the mark stands.
+    """Return the commands of processes that have the mark in their environment.
 
-    Without Ray's agents, which tell a cluster for a minute that it is gone, and
-    without Python's own.
+    Ray's agents, which end a minute later, and Python's resource tracker are left out.
     """
     wanted, found = f"{MARK}={mark}".encode(), []
     for process in Path("/proc").glob("[0-9]*"):
@@ -111,43 +110,43 @@ import mjrec
 from engine_runs import odd_work, submit
 from mjrec.engines.jobs import Run
 from mjrec.signals import exiting_on_signals
-place = Path(sys.argv[1])
-work = odd_work(shared=place / "shared", left=str(place / "left"))
+directory = Path(sys.argv[1])
+work = odd_work(shared=directory / "shared", left=str(directory / "left"))
 with exiting_on_signals(), Run(eval(f"mjrec.{sys.argv[2]}"), work) as run:
-    submit(run, "held", do="hold", begun=str(place / "begun"))
+    submit(run, "held", do="hold", begun=str(directory / "begun"))
     submit(run, *map(str, range(20)), do="echo")
     list(run.results())
 """
 
 
 @contextlib.contextmanager
-def driver(place, engine, **environ):
-    """Have a driver, in a session of its own, of whose jobs one is being done."""
+def driver(directory, engine, **environ):
+    """Start a driver in a new session, and wait until it runs a job."""
     with subprocess.Popen(
-        [sys.executable, "-c", DRIVER, str(place), engine],
+        [sys.executable, "-c", DRIVER, str(directory), engine],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ},
         start_new_session=True,
     ) as process:
-        wait_until(lambda: lines(place / "begun"), seconds=120)
+        wait_until(lambda: lines(directory / "begun"), seconds=120)
         yield process
 
 
 def wait_for_end(pid):
-    """Wait until a process that need not be a child is gone."""
+    """Wait until a process, which need not be a child, has ended."""
     with contextlib.suppress(ProcessLookupError):
         descriptor = os.pidfd_open(pid)
         ready, _, _ = select.select([descriptor], [], [], 30)
         os.close(descriptor)
-        assert ready, f"process {pid} goes on"
+        assert ready, f"process {pid} is still running"
 
 
 def lines(path):
-    """Return the lines of a file; none where there is no file."""
+    """Return the lines of a file, or none if it is missing."""
     return path.read_text().splitlines() if path.exists() else []
 
 
 def run_python(*arguments, text=None, **environ):
-    """Run Python, which finds these helpers, and return what it prints."""
+    """Run Python with these helpers in its path, and return its output."""
     done = subprocess.run(
         [sys.executable, "-W", "error", *arguments],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation has recorded, whoever ran it and under whatever names."""
+"""Recorded content of evaluations, without the facts that differ between runs."""
 
 import csv
 
@@ -10,29 +10,29 @@ from mjrec.formats.trajectory_file import open_trajectory
 
 
 def recorded_in(evaluation):
-    """Return what was recorded of each episode: every dataset, and videos as bytes.
+    """Return datasets and videos by task, seed and episode.
 
-    By task, seed and episode; what differs with each run (names, times, versions) is
-    left out.
+    Names, times and versions are left out.
     """
     with (evaluation.directory / "timing.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     found = {}
     for row in rows:
-        of = (row["task"], row["seed"], row["episode"])
+        key = (row["task"], row["seed"], row["episode"])
         folder = evaluation.directory / row["folder"]
         with open_trajectory(folder / row["trajectory"]) as reader:
-            promised = (reader.facts.get("video") or {}).get("selection")
-        found[*of, "trajectory"] = (datasets_in(folder / row["trajectory"]), promised)
+            selection = (reader.facts.get("video") or {}).get("selection")
+        datasets = datasets_in(folder / row["trajectory"])
+        found[*key, "trajectory"] = (datasets, selection)
         if row["video"]:
             video = folder / row["video"]
             hashes = video.with_suffix(".framehash").read_text()
-            found[*of, "video"] = (video.read_bytes(), hashes)
+            found[*key, "video"] = (video.read_bytes(), hashes)
     return found
 
 
 def datasets_in(path):
-    """Return the datasets of a finished trajectory by name: type, shape, content."""
+    """Return type, shape and bytes of a finished trajectory's datasets by name."""
     found = {}
 
     def note(name, item):

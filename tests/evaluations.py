@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluations that were never run: their files, from returns by hand."""
+"""Files of evaluations, written from given returns without running anything."""
 
 import re
 
@@ -24,7 +24,7 @@ def write_evaluation(
     *,
     score_ranges=None,
     across=None,
-    bootstrap=Bootstrap(resamples=10),  # noqa: B008  it is frozen
+    bootstrap=Bootstrap(resamples=10),  # noqa: B008  immutable
     versions=None,
     monitor=None,
     videos=None,
@@ -33,12 +33,12 @@ def write_evaluation(
 ):
     """Write the results of an evaluation, and return its directory.
 
-    `returns` has those of each task, seed and episode; None is a failed one. `monitor`
-    is the infix of those that recorded, which have left a journal each. `videos` has
-    each task's video of its first episode, and `plan` further fields of the plan.
+    `returns` has the return of each task, seed and episode, None for a failed episode.
+    With `monitor`, an infix, each task has a journal. `videos` names the video of each
+    task's first episode. `plan` has further fields of the plan.
     """
     folders = {task: re.sub(r"[^\w.-]", "-", task) for task in returns}
-    asked = EvaluationPlan(
+    planned = EvaluationPlan(
         **{
             "tasks": tuple(EvaluatedTask(*each) for each in folders.items()),
             "policy": "random",
@@ -51,24 +51,24 @@ def write_evaluation(
         task: [
             _result(task, seed, number, total, monitor, index * len(totals) + number)
             for index, (seed, totals) in enumerate(
-                zip(asked.seeds, by_seed, strict=True)
+                zip(planned.seeds, by_seed, strict=True)
             )
             for number, total in enumerate(totals)
         ]
         for task, by_seed in returns.items()
     }
     directory.mkdir(parents=True, exist_ok=True)
-    for task, of in results.items() if monitor else ():
-        entries = [_entry(each) for each in of if each.total_reward is not None]
+    for task, rows in results.items() if monitor else ():
+        entries = [_entry(each) for each in rows if each.total_reward is not None]
         write_journal(directory / folders[task], monitor, task, entries)
     if not finished:
-        content = {"format_version": 1, "plan": to_json(asked)}
+        content = {"format_version": 1, "plan": to_json(planned)}
         (directory / "evaluation.json").write_text(dumps(content))
         return directory
     ranges, videos = score_ranges or {}, videos or {}
 
     def scale(task):
-        return ranges.get(task, default_score_range(task, asked.max_steps))
+        return ranges.get(task, default_score_range(task, planned.max_steps))
 
     def files(result):
         is_first = result is results[result.task][0]
@@ -77,14 +77,16 @@ def write_evaluation(
 
     evaluation = Evaluation(
         directory=directory,
-        plan=asked,
+        plan=planned,
         summaries=[
             summarize_results(task, each, score_range=scale(task), bootstrap=bootstrap)
             for task, each in results.items()
         ],
         across=across,
         bootstrap=bootstrap,
-        selection={task: [ChosenEpisode(asked.seeds[0], 0, "best")] for task in videos},
+        selection={
+            task: [ChosenEpisode(planned.seeds[0], 0, "best")] for task in videos
+        },
         versions=versions or {},
     )
     write_results(evaluation, [r for each in results.values() for r in each], files)
@@ -92,9 +94,9 @@ def write_evaluation(
 
 
 def _entry(result):
-    of = {"seed": result.seed, "episode": result.episode}
+    unit = {"seed": result.seed, "episode": result.episode}
     reward = result.total_reward
-    return entry(result.episode_id, reward=reward, seed=result.seed, evaluation=of)
+    return entry(result.episode_id, reward=reward, seed=result.seed, evaluation=unit)
 
 
 def _result(task, seed, number, total, monitor, episode_id):
@@ -120,7 +122,7 @@ def _result(task, seed, number, total, monitor, episode_id):
 
 
 def write_recorded(directory, tasks, *, rewards=(3.0, 1.0, None, 2.0), **options):
-    """Write an evaluation of two seeds, whose monitors have left their journals."""
+    """Write an evaluation of two seeds with the journals of its monitors."""
     half = len(rewards) // 2
     returns = {task: [rewards[:half], rewards[half:]] for task in tasks}
     return write_evaluation(

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments that are not what their name says, recorded as they are.
+"""Environments that differ from the one that their name states.
 
-Each function changes what a step returns: observation, reward, terminated, truncated
-and info.
+Each function changes a step's observation, reward, terminated, truncated and info.
 """
 
 import contextlib
@@ -14,7 +13,7 @@ from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 
 @contextlib.contextmanager
 def doctored(change):
-    """Let each step of a pendulum or a cheetah give what `change` makes of it."""
+    """Apply `change` to each step of pendulums and cheetahs."""
 
     def changed(step):
         return lambda env, action: change(env, *step(env, action))
@@ -53,7 +52,7 @@ def make_heavy(env, *result):
 
 
 def raise_gravity(env, *result):
-    """To that of the moon."""
+    """Raise it to that of the moon."""
     env.model.opt.gravity[2] = -1.62
     return result
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs that run in a Python of their own."""
+"""Programs in another Python process."""
 
 import os
 import subprocess
@@ -16,12 +16,12 @@ def without_gl(**variables):
 
 
 def run_python(code, *arguments, status=0, under=(), **options):
-    """Run code, which ends with `status`, or anyhow if that is None.
+    """Run `python -c code`, and check its exit status.
 
     Args:
-        code: the program; it is `python -c`.
+        code: the program.
         *arguments: its `sys.argv[1:]`.
-        status: what it returns, negative for a signal.
+        status: the expected status, negative for a signal, or None for any.
         under: a command that runs Python.
         **options: of `subprocess.run`.
     """

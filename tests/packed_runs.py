@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packed runs to verify, and to forge: unpacked, edited, and made to fit again."""
+"""Packed runs for tests: recorded, unpacked, edited and made consistent again."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ def record_pendulum(directory, episodes=3, *, longest=8, **options):
 
 
 def unpacked(archive, into):
-    """Unpack a packed run of ours, and return its folder."""
+    """Unpack a packed run, and return its folder."""
     with zipfile.ZipFile(archive) as file:
         file.extractall(into)
     [folder] = into.iterdir()
@@ -41,7 +41,7 @@ def unpacked(archive, into):
 
 
 def make_bag_fit(bag):
-    """Let the lists of a packed run say what is there, whatever that is."""
+    """Update the file lists of a packed run."""
     sizes = [path.stat().st_size for path in _files(bag / "data")]
     info, count = bag / "bag-info.txt", f"{sum(sizes)}.{len(sizes)}"
     info.write_text(re.sub(r"(?<=Oxum: )[\d.]+", count, info.read_text()))
@@ -51,8 +51,8 @@ def make_bag_fit(bag):
 
 
 def describe_again(bag):
-    """Let all descriptions of a packed run follow from its recordings."""
-    # The second time with the sizes that the first has made.
+    """Rewrite all descriptions of a packed run from its recordings."""
+    # Descriptions contain sizes, which the first round changes.
     for _ in range(2):
         for name, text in written_again(bag).items():
             is_tag = (bag / name).exists()
@@ -60,13 +60,13 @@ def describe_again(bag):
 
 
 def the(folder, pattern):
-    """Return the one file below a folder that a pattern stands for."""
+    """Return the only file below a folder that matches."""
     [path] = folder.rglob(pattern)
     return path
 
 
 def edit_json(path, edit):
-    """Change what a file of JSON holds, and write it as it was written."""
+    """Edit the content of a JSON file, and keep its layout."""
     text = path.read_text()
     content = json.loads(text)
     edit(content)

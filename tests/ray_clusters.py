@@ -15,7 +15,7 @@ SMALL_STORE = 80 << 20
 
 @contextlib.contextmanager
 def home_for_ray(home):
-    """Let Ray start from an empty home, and see that nothing of it is left."""
+    """Let Ray start with an empty home, and check that it leaves nothing there."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOME", str(home))
         patch.setenv(MARK, str(os.getpid()))
@@ -32,7 +32,7 @@ def home_for_ray(home):
 
 @contextlib.contextmanager
 def own_ray(*, cpus):
-    """Have a Ray that this process has started for itself."""
+    """Start a Ray cluster for this process."""
     ray.init(
         address="local",
         num_cpus=cpus,

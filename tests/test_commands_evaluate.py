@@ -22,7 +22,7 @@ def raising(observation):
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """Return what runs the command and gives its status and what it said."""
+    """Return a function that runs the command, and gives status, output and errors."""
     (tmp_path / "few_policies.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
 
@@ -35,8 +35,8 @@ def run(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_a_table_says_what_came_of_it(run, tmp_path):
-    """Each task has a row, and the videos and the directory are named."""
+def test_table_has_a_row_for_each_task(run, tmp_path):
+    """Videos and directory are named below it."""
     policy = ("--policy", "few_policies:zero", "--keep", "best")
     status, out, err = run(TASK, *policy, "--confidence", "0.9")
     assert status == 0
@@ -47,14 +47,14 @@ def test_a_table_says_what_came_of_it(run, tmp_path):
     assert "1 video:" in out
     assert str(tmp_path / "e") in out
     assert "2/2 episodes" in err
-    # The recordings name the command that started the workers.
+    # The workers record the command that started them.
     manifest = next((tmp_path / "e").rglob("*.manifest.json"))
     provenance = json.loads(manifest.read_text())["mjrec"]["provenance"]
     assert provenance["command"] == sys.orig_argv
 
 
 def test_tasks_with_a_scale_are_summarized_together(run):
-    """What is left out is named, with the reason."""
+    """Other tasks are named with the reason."""
     double = "InvertedDoublePendulum-v5"
     ranges = (f"{TASK}=0:10", "--score-range", f"{double}=0:100")
     tasks = (TASK, double, "Hopper-v5", "--policy", "zero", "--keep", "none")
@@ -64,21 +64,21 @@ def test_tasks_with_a_scale_are_summarized_together(run):
     assert "left out: Hopper-v5: it has no default scale" in out
 
 
-def test_json_is_one_object_and_nothing_else(run):
-    """For programs; over tasks too. A mean that is just high enough is no failure."""
+def test_json_output_is_one_object(run):
+    """A mean equal to `--fail-under` is no failure."""
     policy = ("--policy", "zero", "--keep", "none", "--json")
     least = ("--score-range", f"{TASK}=0:10", "--fail-under", f"{TASK}=5")
     status, out, err = run(TASK, *policy, *least)
-    said = json.loads(out)
+    content = json.loads(out)
     assert (status, err) == (0, "")
-    [task] = said["tasks"]
+    [task] = content["tasks"]
     assert task["mean"] == 5.0
-    assert said["across"]["iqm"] == 0.5
-    assert (said["episodes"], said["failed"]) == (2, 0)
+    assert content["across"]["iqm"] == 0.5
+    assert (content["episodes"], content["failed"]) == (2, 0)
 
 
 def test_failed_episodes_fail_the_command(run, tmp_path):
-    """The results are there, and foreign text moves no cursor and paints nothing."""
+    """Results are written, and control characters of messages are escaped."""
     policy = ("--policy", "few_policies:raising", "--keep", "none")
     status, out, _ = run(TASK, *policy, "--fail-under", f"{TASK}=-1000")
     assert status == 1
@@ -89,8 +89,8 @@ def test_failed_episodes_fail_the_command(run, tmp_path):
     assert (tmp_path / "e" / "results.json").exists()
 
 
-def test_a_directory_is_enough_to_go_on(run, capsys):
-    """Its best, median and worst episodes are named, each with a file."""
+def test_resume_needs_only_the_directory(run, capsys):
+    """Best, median and worst episodes are named with their files."""
     low = ("--fail-under", f"{TASK}=5.5")
     status, out, _ = run(TASK, "--policy", "zero", "--keep", "none", *low)
     assert status == 1
@@ -105,38 +105,34 @@ def test_a_directory_is_enough_to_go_on(run, capsys):
     assert "seeds was [0, 1, 2]" in capsys.readouterr().err
 
 
-def test_an_evaluation_is_recovered_and_rendered_as_one(
+def test_evaluation_is_rendered_and_recovered_as_one(
     run, tmp_path, monkeypatch, capsys
 ):
-    """All folders in it; its table of files is right before and after.
-
-    Where nothing can be drawn that is said, and how to draw elsewhere.
-    """
+    """Without OpenGL, a message says how to render elsewhere."""
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
     status, out, err = run(TASK, "--policy", "zero", "--keep", "all")
     assert status == 0
-    place = tmp_path / "e"
+    directory = tmp_path / "e"
     assert "Videos cannot be drawn on this machine" in err
     assert f"mjrec render e/{TASK}" in out
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    table = (place / "timing.csv").read_text()
+    table = (directory / "timing.csv").read_text()
     rows = [row.split(",") for row in table.splitlines()[1:]]
-    paths = [place / row[5] / row[-1] for row in rows]
-    assert not list(place.rglob("*.mp4"))
-    # One of them by its number, as `mjrec list` has it; then all.
+    paths = [directory / row[5] / row[-1] for row in rows]
+    assert not list(directory.rglob("*.mp4"))
     assert commands.main(["render", "e", "--episode", "1"]) == 0
     assert [path.is_file() for path in paths] == [False, True]
     assert commands.main(["render", "e", "--episode", "9"]) == 1
     assert "No episode 9 is recorded" in capsys.readouterr().err
     assert commands.main(["render", "e"]) == 0
     assert all(path.is_file() for path in paths)
-    assert (place / "timing.csv").read_text() == table
+    assert (directory / "timing.csv").read_text() == table
     capsys.readouterr()
-    [manifest, *_] = place.rglob("*.manifest.json")
+    [manifest, *_] = directory.rglob("*.manifest.json")
     manifest.unlink()
     assert commands.main(["recover", "e"]) == 0
-    assert f"{manifest.parent.relative_to(place)}" in capsys.readouterr().out
+    assert f"{manifest.parent.relative_to(directory)}" in capsys.readouterr().out
     assert manifest.is_file()
 
 
@@ -150,8 +146,9 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
         ([TASK, "--seeds", "0,x"], "0,1,2"),
     ],
 )
-def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):
-    """It says what there is, and nothing is run."""
+def test_wrong_command_line_gives_one_line_and_runs_nothing(
+    run, tmp_path, arguments, words
+):
     status, out, err = run(*arguments, "--policy", "zero")
     lines = [line for line in err.splitlines() if line.startswith("mjrec: ")]
     assert (status, out, len(lines)) == (1, "", 1)
@@ -160,9 +157,7 @@ def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):
     assert not (tmp_path / "e").exists()
 
 
-def test_ctrl_c_says_how_to_go_on(run, monkeypatch):
-    """The exit status is that of an interruption."""
-
+def test_ctrl_c_says_how_to_continue(run, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 

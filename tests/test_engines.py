@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds of jobs on every engine: ours, and any executor of one's own.
-
-`docs/howto/clusters.md` lists these guarantees.
-"""
+"""Guarantees of jobs on every engine and executor, as in `docs/howto/clusters.md`."""
 
 import os
 import signal
@@ -25,42 +22,41 @@ from mjrec.engines.choice import engine_from
 from mjrec.engines.jobs import JobOutcome, Run
 from mjrec.errors import Error, InvalidArgument
 
-pytestmark = [
-    # Ray's own connections and pipes, of which it says so when they are collected.
-    pytest.mark.filterwarnings("ignore::ResourceWarning")
-]
+# Ray leaves connections and pipes to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 # Real Ray, and Slurm jobs through submitit, take seconds each.
 on_each = parametrize("engine", ["local", "own", "slurm", "ray", "dask"], default=2)
 
 
 @pytest.fixture(scope="module")
 def engines(tmp_path_factory):
-    with each_engine(tmp_path_factory.mktemp("home")) as made:
-        yield made
+    with each_engine(tmp_path_factory.mktemp("home")) as engines:
+        yield engines
 
 
 @pytest.fixture
 def begin(engine, engines, tmp_path):
-    """Return what begins a run of `odd_jobs` on an engine."""
-    made = []
+    """Return a function that starts a run of `odd_jobs` on an engine."""
+    executors = []
     (tmp_path / "shared").mkdir()
 
-    def begun(workers=1, make="make", **settings):
-        made.append(engines(engine, workers))
-        return Run(made[-1], odd_work(make, shared=tmp_path / "shared", **settings))
+    def begin(workers=1, make="make", **settings):
+        executors.append(engines(engine, workers))
+        work = odd_work(make, shared=tmp_path / "shared", **settings)
+        return Run(executors[-1], work)
 
-    yield begun
-    for executor in made:
+    yield begin
+    for executor in executors:
         executor.shutdown()
     assert not list((tmp_path / "shared").iterdir())
 
 
 @on_each
 def test_jobs_get_settings_and_arguments(begin, engine, tmp_path, monkeypatch):
-    """Also those that are submitted while results come, and after.
+    """Jobs may be submitted between results.
 
-    Children work where the driver is, out of Ctrl-C's reach; each stays for later
-    jobs, in Slurm of the same array.
+    A child runs in the driver's directory, in a session of its own, and is kept for
+    later jobs, by Slurm for jobs of the same array.
     """
     monkeypatch.chdir(tmp_path)
     with begin() as run:
@@ -71,20 +67,19 @@ def test_jobs_get_settings_and_arguments(begin, engine, tmp_path, monkeypatch):
     assert first["session"] == first["pid"]
     with begin(2, seeds=[1, 2]) as run:
         submit(run, "0", do="echo", text="ß\n")
-        seen = []
+        keys = []
         for outcome in run.results():
-            seen.append(outcome.key)
-            if len(seen) < 4:
-                submit(run, str(len(seen)), do="echo")
+            keys.append(outcome.key)
+            if len(keys) < 4:
+                submit(run, str(len(keys)), do="echo")
         submit(run, "later", do="echo", text="ß\n")
         [value] = values(run)
-    assert seen == ["0", "1", "2", "3"]
+    assert keys == ["0", "1", "2", "3"]
     arguments = {"do": "echo", "text": "ß\n"}
     assert value == {"arguments": arguments, "settings": {"seeds": [1, 2]}}
 
 
-def test_a_dask_scheduler_that_does_not_answer(monkeypatch):
-    """The error says so soon, and what to do."""
+def test_unreachable_dask_scheduler_is_an_error(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("mjrec.engines.choice._SECONDS_TO_REACH", 0.1)
     with pytest.raises(Error, match=r"answers at tcp://127.0.0.1:1. `dask scheduler`"):
@@ -92,8 +87,8 @@ def test_a_dask_scheduler_that_does_not_answer(monkeypatch):
 
 
 @on_each
-def test_jobs_run_beside_each_other(begin, tmp_path):
-    """Two that wait for each other both come to their end; the caller may look on."""
+def test_jobs_run_in_parallel_and_results_have_a_timeout(begin, tmp_path):
+    """Each of two jobs waits for the other."""
     os.mkfifo(tmp_path / "pipe")
     with begin(2) as run:
         submit(run, "a", do="meet", pipe=str(tmp_path / "pipe"), mode="rb")
@@ -103,12 +98,8 @@ def test_jobs_run_beside_each_other(begin, tmp_path):
 
 
 @on_each
-def test_what_a_handler_raises_is_the_outcome(begin, caplog):
-    """In one line; the child goes on, and the log has the traceback.
-
-    So it has warnings, under their own name, each once. Nothing that a job prints is
-    an answer.
-    """
+def test_exception_of_a_handler_is_the_outcome(begin, caplog):
+    """Tracebacks and warnings are logged once. Printed text is ignored."""
     with begin() as run:
         submit(run, *"ab", do="talk")
         assert values(run) == [{"read": ""}] * 2
@@ -123,13 +114,13 @@ def test_what_a_handler_raises_is_the_outcome(begin, caplog):
     assert (found["path"].failure or "").startswith("TypeError: Object of type")
     assert found["after"].value is not None
     assert 'raise ValueError("not\\n  today")' in caplog.text
-    told = [record.getMessage() for record in caplog.records if record.name == "odd"]
-    assert told == ["a warning of 7"]
+    odd = [record.getMessage() for record in caplog.records if record.name == "odd"]
+    assert odd == ["a warning of 7"]
 
 
 @on_each
-def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
-    """Three times in all; no other job fails."""
+def test_job_is_tried_three_times_if_its_child_dies(begin, tmp_path, caplog):
+    """No other job fails."""
     with begin(2) as run:
         once = str(tmp_path / "once")
         submit(run, "once", do="die", how="SIGSEGV", once=once)
@@ -146,37 +137,33 @@ def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
 
 
 @on_each
-def test_a_job_that_takes_too_long_is_ended(begin, tmp_path):
-    """Though it holds the interpreter; the next try finds what is said of it."""
+def test_time_limit_ends_a_job_that_holds_the_interpreter(begin, tmp_path):
+    """The next try finds the reason in a file."""
     with begin() as run:
         submit(run, "a", do="hang", mark=str(tmp_path / "mark"))
         assert outcomes(run)["a"].value == {"mark": "too slow"}
 
 
 @on_each
-def test_a_handler_that_cannot_be_made(begin):
-    """An error of ours keeps its class and its facts; of others it is told.
-
-    So it is of children that die as they begin.
-    """
+def test_failure_to_make_a_handler_is_raised(begin):
+    """Errors of mjrec keep their class and attributes."""
     with begin(make="make_no_name") as run:
         submit(run, *"abc", do="echo")
         with pytest.raises(mjrec.UnknownName, match="no camera 'egocentric'") as raised:
             outcomes(run)
     assert raised.value.available == ["back", "side"]
-    for make, said in (
+    for make, message in (
         ("make_nothing", "ValueError: there is no handler"),
         ("make_and_die", "No worker can start.* status 3.*: a library is missing"),
     ):
         with begin(make=make) as run:
             submit(run, "a", do="echo")
-            with pytest.raises(Error, match=said):
+            with pytest.raises(Error, match=message):
                 outcomes(run)
 
 
 @pytest.mark.parametrize("engine", ["local", "own"])
-def test_children_that_cannot_begin_do_not_end_one_at_work(begin, tmp_path):
-    """It does the jobs of all; how often others have died is no fault of theirs."""
+def test_one_child_does_all_jobs_if_others_cannot_start(begin, tmp_path):
     with begin(2, make="make_one", place=str(tmp_path)) as run:
         begun, go = str(tmp_path / "begun"), str(tmp_path / "go")
         submit(run, "a", do="hold", begun=begun, go=go)
@@ -191,11 +178,8 @@ def test_children_that_cannot_begin_do_not_end_one_at_work(begin, tmp_path):
 
 
 @on_each
-def test_cancelling_ends_what_is_at_work(begin, tmp_path):
-    """Each may leave a word; a second time is no more than once.
-
-    The job of one that was killed from outside is done by another.
-    """
+def test_cancelling_ends_running_jobs_once(begin, tmp_path):
+    """The job of a killed child is taken by another before."""
     run = begin(left=str(tmp_path / "left"))
     submit(run, "a", "b", do="hold", begun=str(tmp_path / "begun"))
     killed = wait_for(tmp_path / "begun", run)
@@ -210,8 +194,8 @@ def test_cancelling_ends_what_is_at_work(begin, tmp_path):
 
 
 @parametrize("engine", ["own", "slurm", "ray"], default=1)
-def test_a_shared_directory_is_needed_elsewhere(begin, tmp_path):
-    """And what others keep in it stays; two runs there do not know of each other."""
+def test_engines_of_other_machines_need_a_shared_directory(begin, tmp_path):
+    """Other files in it stay, and runs in it are independent."""
     with begin() as run:
         (tmp_path / "shared" / "results.csv").touch()
         with pytest.raises(InvalidArgument, match="that all workers see"):

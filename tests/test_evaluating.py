@@ -50,7 +50,6 @@ SIXTEEN = {"seeds": [5], "num_seeds": None, "episodes": 16}
 
 
 def run(directory, **options):
-    """Evaluate something small."""
     few = {"tasks": [PENDULUM], "policy": "random", "episodes": 2, "num_seeds": 2}
     small = {"workers": 2, "keep": "none", "max_steps": 5, "height": 32, "width": 32}
     return evaluate(**{**few, **small, **options}, directory=directory)
@@ -68,8 +67,8 @@ def rows_of(name, directory):
         return list(csv.DictReader(file))
 
 
-def begun(directory):
-    """Return how many episodes were begun in all, by the journals."""
+def started_episodes(directory):
+    """Return the number of episodes begun, by the journals."""
     journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
     return sum(path.read_text().count('{"begun"') for path in journals)
 
@@ -78,18 +77,15 @@ def begun(directory):
 def reference(tmp_path_factory):
     """An evaluation by one worker, without videos."""
     directory = tmp_path_factory.mktemp("evaluations") / "reference"
-    # What a dead run of an engine has left is in nobody's way.
+    # Leftovers of a killed run do not prevent an evaluation.
     (directory / ".mjrec.work" / "run").mkdir(parents=True)
     (directory / ".mjrec.evaluation.lock").touch()
     run(directory, tasks=[PENDULUM, DOUBLE], workers=1)
     return directory
 
 
-def test_every_episode_of_every_task_and_seed_is_there(reference):
-    """In the order of the plan, each with its trajectory, and all read back.
-
-    What takes long begins first, so that no worker ends long after the others.
-    """
+def test_results_have_all_episodes_in_the_order_of_the_plan(reference):
+    """Each has a trajectory. The task with more joints starts first."""
     results = list(read_results(reference))
     assert [(each.task, *each.unit) for each in results] == [
         (task, seed, episode)
@@ -100,33 +96,27 @@ def test_every_episode_of_every_task_and_seed_is_there(reference):
     assert all(each.failure is None and each.length <= 5 for each in results)
     files = [p for each in reference.glob("*/*") for p in finished_trajectories(each)]
     assert len(files) == 8
-    assert begun(reference) == 8
-    begun_at = {
-        row["task"]: float(row["start"]) for row in rows_of("timing", reference)
-    }
-    # One of its two pendulums has one joint more.
-    assert begun_at[DOUBLE] < begun_at[PENDULUM]
+    assert started_episodes(reference) == 8
+    started = {row["task"]: float(row["start"]) for row in rows_of("timing", reference)}
+    assert started[DOUBLE] < started[PENDULUM]
 
 
 # Takes more than five seconds: 200 episodes.
-def test_a_large_evaluation_is_a_few_files(tmp_path):
-    """Of 100 seeds with 2 episodes each at most 60; every trajectory is read back."""
+def test_200_episodes_fit_into_60_files(tmp_path):
     evaluation = run(tmp_path / "e", num_seeds=100, max_steps=2)
     assert sum(path.is_file() for path in evaluation.directory.rglob("*")) <= 60
     for result in evaluation.results[::40]:
         assert len(mjrec.load_trajectory(evaluation.file_of(result))) == 2
 
 
-def test_the_chosen_episodes_get_videos(tmp_path):
-    """By rule, for each task; table, metadata and report of it agree.
-
-    What is told of the progress goes up to the end, and never backwards.
-    """
-    told = []
-    evaluation = run(tmp_path / "e", keep="best,worst", on_progress=told.append)
-    assert [each.done for each in told] == sorted(each.done for each in told)
-    assert (told[-1].done, told[-1].total, told[-1].failed) == (4, 4, 0)
-    assert (told[-1].videos_done, told[-1].videos) == (2, 2)
+def test_selected_episodes_get_videos(tmp_path):
+    """Tables and metadata agree on them. Progress never decreases."""
+    progress = []
+    evaluation = run(tmp_path / "e", keep="best,worst", on_progress=progress.append)
+    assert [each.done for each in progress] == sorted(each.done for each in progress)
+    last = progress[-1]
+    assert (last.done, last.total, last.failed) == (4, 4, 0)
+    assert (last.videos_done, last.videos) == (2, 2)
     read = read_results(tmp_path / "e")
     columns = read.by_task[PENDULUM]
     returns = columns.rows["total_reward"].tolist()
@@ -139,14 +129,14 @@ def test_the_chosen_episodes_get_videos(tmp_path):
         tmp_path / "e" / str(columns.video_path(index)) for index in columns.videos
     }
     for path in evaluation.videos:
-        said = json.loads(metadata_path(path).read_text())["selection"]
-        assert (said["rule"], said["scope"]) == ("best,worst", "evaluation")
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        assert digest in metadata_path(path).read_text()
+        metadata = metadata_path(path).read_text()
+        selection = json.loads(metadata)["selection"]
+        assert (selection["rule"], selection["scope"]) == ("best,worst", "evaluation")
+        assert hashlib.sha256(path.read_bytes()).hexdigest() in metadata
 
 
-class Large:
-    """A policy that is large, and draws from generators that it was not given."""
+class LargePolicy:
+    """Has 100 MB of weights, and draws from global random generators."""
 
     def __init__(self):
         self.weights = np.ones(100 << 20, np.uint8)
@@ -155,38 +145,35 @@ class Large:
         return self.weights[-1] * np.random.uniform(-3, 3, 1) * random.random()
 
 
-@pytest.fixture(scope="module")
-def large():
-    """What evaluates it."""
-    options = {"tasks": [PENDULUM, DOUBLE], "policy": Large(), "keep": "best,worst"}
-    return functools.partial(run, **options)
+def run_large(directory, **options):
+    tasks, policy = [PENDULUM, DOUBLE], LargePolicy()
+    return run(directory, tasks=tasks, policy=policy, keep="best,worst", **options)
 
 
 @pytest.fixture(scope="module")
-def by_one_worker(large, tmp_path_factory):
-    return large(tmp_path_factory.mktemp("one") / "e", workers=1)
+def by_one_worker(tmp_path_factory):
+    return run_large(tmp_path_factory.mktemp("one") / "e", workers=1)
 
 
 @pytest.fixture
 def engines(tmp_path_factory):
-    with each_engine(tmp_path_factory.mktemp("home")) as made:
-        yield made
+    with each_engine(tmp_path_factory.mktemp("home")) as engines:
+        yield engines
 
 
-# Takes more than five seconds: evaluations with videos, in workers that start for it.
-# Ray's own connections and pipes, of which it says so when they are collected.
+# Takes more than five seconds: evaluations with videos, in new workers.
+# Ray leaves connections and pipes to the garbage collector.
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @parametrize(
     ("kind", "workers"),
     [("local", 5), ("ray", 2), ("slurm", 2), ("local", 2), ("dask", 2)],
     default=3,
 )
-def test_workers_and_engines_change_nothing(
-    by_one_worker, large, engines, tmp_path, kind, workers
+def test_engines_produce_the_files_of_one_worker(
+    by_one_worker, engines, tmp_path, kind, workers
 ):
-    """Results, trajectories, videos and names are those of one worker."""
     here, engine = by_one_worker, engines(kind, workers)
-    there = large(tmp_path / "e", engine=engine, workers=None)
+    there = run_large(tmp_path / "e", engine=engine, workers=None)
     engine.shutdown()
     assert contents(there.directory) == contents(here.directory)
     assert there.pending == here.pending == {}
@@ -200,37 +187,32 @@ def test_workers_and_engines_change_nothing(
     assert listed_in(there.directory) == {path.name for path in there.videos}
 
 
-class Wandering(Executor):
-    """An executor whose worker does each job as on a machine with another home.
-
-    Args:
-        homes: where these are.
-    """
+class NewHomes(Executor):
+    """Runs each job as on a machine with another home directory."""
 
     def __init__(self, homes):
         self.homes = homes
         self.workers = {}
 
     def submit(self, fn, /, *args, **kwargs):
-        place, job = json.loads(json.dumps(args))
-        if place not in self.workers:
-            work = json.loads(Path(place, "work.json").read_bytes())
+        directory, job = json.loads(json.dumps(args))
+        if directory not in self.workers:
+            work = json.loads(Path(directory, "work.json").read_bytes())
             module, _, name = work["entry"].partition(":")
             make = getattr(importlib.import_module(module), name)
-            self.workers[place] = make(work["settings"])
+            self.workers[directory] = make(work["settings"])
         future = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
-            future.set_result({"value": self.workers[place](job["arguments"])})
+            future.set_result({"value": self.workers[directory](job["arguments"])})
         return future
 
 
 @pytest.mark.dm_control
-def test_machines_with_other_homes_draw_what_others_recorded(tmp_path):
-    """Also where there is only a compiled model; and so does this machine."""
+def test_compiled_models_are_shared_between_home_directories(tmp_path):
     pytest.importorskip("dm_control")
-    far = {"engine": Wandering(tmp_path / "homes"), "workers": None, "keep": "best"}
-    evaluation = run(tmp_path / "out", tasks=["dm_control/swimmer-swimmer6"], **far)
+    options = {"engine": NewHomes(tmp_path / "homes"), "workers": None, "keep": "best"}
+    evaluation = run(tmp_path / "out", tasks=["dm_control/swimmer-swimmer6"], **options)
     assert not list(evaluation.directory.rglob("*.model.*.zip"))
     assert len(list(evaluation.directory.rglob("*.mp4"))) == 1
     folder, *_ = (path.parent for path in evaluation.directory.glob("*/*/*.h5"))
@@ -239,10 +221,10 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path):
 
 
 @pytest.mark.thorough
-def test_videos_do_not_depend_on_what_was_run_before(tmp_path):
-    """The camera is placed anew in each episode, not once for an environment."""
+def test_videos_do_not_depend_on_earlier_episodes(tmp_path):
+    """The camera is placed again in each episode."""
     options = {"tasks": ["Reacher-v5"], "num_seeds": 1, "keep": "all", "max_steps": 12}
-    # In chunks of two by one worker, and of three and then two.
+    # Chunks have two episodes, or three and then two.
     whole = run(tmp_path / "whole", **options, episodes=8, workers=1)
     run(tmp_path / "parts", **options, episodes=3, workers=1)
     parts = run(tmp_path / "parts", **options, episodes=8, workers=3, resume=True)
@@ -251,42 +233,41 @@ def test_videos_do_not_depend_on_what_was_run_before(tmp_path):
 
 
 def listed_in(directory):
-    """Return the names of the videos in all manifests."""
     texts = map(Path.read_text, directory.glob("*/*/*.manifest.json"))
     return {video for text in texts for video, _ in json.loads(text)["videos"]}
 
 
-class Stumbling:
-    """Pushes gently; does something else in the third step of episodes of seed 5."""
+class FaultyPolicy:
+    """Calls `faults[n]` in the third step of episode n of seed 5."""
 
-    def __init__(self, wrong):
-        self.by_seed = {episode_seeds(5, n).policy: do for n, do in wrong.items()}
+    def __init__(self, faults):
+        self.by_seed = {episode_seeds(5, n).policy: do for n, do in faults.items()}
 
     def reset(self, seed):
-        self.wrong = self.by_seed.get(seed)
+        self.fault = self.by_seed.get(seed)
         self.steps = 0
 
     def __call__(self, observation):
         self.steps += 1
-        if self.wrong is not None and self.steps == 3:
-            return self.wrong()
+        if self.fault is not None and self.steps == 3:
+            return self.fault()
         return np.full(1, 0.01)
 
 
-def raised(error):
+def fail(error):
     raise error
 
 
-def test_a_policy_that_fails_loses_its_episode_only(tmp_path):
-    """Its reason is one line; its trajectory says that it is not complete."""
-    wrong = {
-        1: functools.partial(raised, RuntimeError("out of\nideas")),
-        2: functools.partial(raised, SystemExit(3)),
+def test_failing_policy_loses_one_episode(tmp_path):
+    """The reason is one line, and the trajectory is marked incomplete."""
+    faults = {
+        1: functools.partial(fail, RuntimeError("out of\nideas")),
+        2: functools.partial(fail, SystemExit(3)),
         3: functools.partial(np.full, 1, np.nan),
         4: functools.partial(np.zeros, 7),
     }
-    options = {"policy": Stumbling(wrong), **SIXTEEN, "episodes": 6, "workers": 1}
-    evaluation = run(tmp_path / "e", **options)
+    options = {**SIXTEEN, "episodes": 6, "workers": 1}
+    evaluation = run(tmp_path / "e", policy=FaultyPolicy(faults), **options)
     assert [each.episode for each in evaluation.failed] == [1, 2, 3, 4]
     reasons = ("out of ideas", "SystemExit: 3", "nan", "action in Box")
     for failed, reason in zip(evaluation.failed, reasons, strict=True):
@@ -295,9 +276,9 @@ def test_a_policy_that_fails_loses_its_episode_only(tmp_path):
         assert (failed.total_reward, failed.length) == (None, 2)
         with open_trajectory(evaluation.file_of(failed)) as reader:
             assert (reader.facts["complete"], reader.facts["length"]) == (False, 2)
-    # What comes after one is not the beginning once more.
-    begun = {states_of(evaluation, each)[0].tobytes() for each in evaluation.results}
-    assert len(begun) == 6
+    # The episode after a failed one has its own initial state.
+    initial = {states_of(evaluation, each)[0].tobytes() for each in evaluation.results}
+    assert len(initial) == 6
     failures = [row["failure"] for row in rows_of("results", tmp_path / "e")]
     assert failures == [each.failure or "" for each in evaluation.results]
     [summary] = evaluation.summaries
@@ -309,19 +290,19 @@ def states_of(evaluation, result):
         return reader.states(0, reader.row_count)
 
 
-# The second draws its springs when it is made.
+# The second has random springs, drawn when it is made.
 @pytest.mark.parametrize("task", [PENDULUM, "dm_control/lqr-lqr_2_1"])
-def test_an_episode_is_the_one_that_a_session_records(tmp_path, task):
-    """Bit for bit, whatever ran before it."""
+def test_episodes_equal_those_of_a_session(tmp_path, task):
     if task.startswith("dm_control/"):
         pytest.importorskip("dm_control")
-    three = {"seed": 4, "episodes": 3, "schedule": "all"}
     session = Session(
         environment=task,
         directory=tmp_path / "session",
         made=EnvironmentOptions(max_steps=5, height=32, width=32),
         monitor=RecorderOptions(workers=0),
-        **three,
+        seed=4,
+        episodes=3,
+        schedule="all",
     )
     with contextlib.closing(record_session(session)) as episodes:
         expected = list(episodes)
@@ -335,54 +316,54 @@ def test_an_episode_is_the_one_that_a_session_records(tmp_path, task):
         assert result.total_reward == theirs.reward
 
 
-ODD = """
+FAULTY_ENVIRONMENT = """
 import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from mjrec.environments.episode_seeds import episode_seeds
 
-class Odd(InvertedPendulumEnv):
+class Faulty(InvertedPendulumEnv):
     def reset(self, *, seed=None, options=None):
         if seed == episode_seeds(0, 1).environment:
             raise OSError("no such pendulum")
-        self.is_odd = seed in [episode_seeds(n, 0).environment for n in (0, 1)]
-        begun = super().reset(seed=seed)
+        self.is_faulty = seed in [episode_seeds(n, 0).environment for n in (0, 1)]
+        initial = super().reset(seed=seed)
         self.data.warning[mujoco.mjtWarning.mjWARN_INERTIA].number = 5
-        return begun
+        return initial
 
     def step(self, action):
-        if self.is_odd:
-            self.is_odd = False
+        if self.is_faulty:
+            self.is_faulty = False
             self.data.qpos[0] = np.inf
         return super().step(action)
 
-gymnasium.register("Odd-v0", Odd)
+gymnasium.register("Faulty-v0", Faulty)
 """
 
 
-def test_errors_and_warnings_are_their_episodes_own(tmp_path, monkeypatch, caplog):
-    """There is no recording where a reset raises; warnings of before are no news.
-
-    What MuJoCo warns of is said once, and no file of its own is left.
-    """
-    (tmp_path / "odd_world.py").write_text(ODD)
+def test_errors_and_warnings_belong_to_their_episodes(tmp_path, monkeypatch, caplog):
+    """A failed reset leaves no recording. MuJoCo's warning is logged once."""
+    (tmp_path / "faulty.py").write_text(FAULTY_ENVIRONMENT)
     monkeypatch.chdir(tmp_path)
-    evaluation = run(tmp_path / "e", tasks=["odd_world:Odd-v0"], episodes=3)
-    # Of the first episode of each seed.
+    evaluation = run(tmp_path / "e", tasks=["faulty:Faulty-v0"], episodes=3)
+    # One for the first episode of each seed.
     assert dict(evaluation.summaries[0].warnings) == {"BADQPOS": 2}
     [failed] = evaluation.failed
     assert failed.failure == "OSError: no such pendulum"
     assert (failed.monitor, failed.episode_id, failed.length) == (None, None, 0)
     assert len([text for text in caplog.messages if text.startswith("MuJoCo")]) == 1
-    assert {each.name for each in tmp_path.glob("*.*")} == {"odd_world.py"}
+    assert {each.name for each in tmp_path.glob("*.*")} == {"faulty.py"}
 
 
-def kill_worker(once=None):
-    if once is None or not once.exists():
-        if once is not None:
-            once.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
+def kill_worker():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def kill_worker_once(marker):
+    if not marker.exists():
+        marker.touch()
+        kill_worker()
     return np.full(1, 0.01)
 
 
@@ -391,11 +372,10 @@ def block(path):
     return np.full(1, 0.01)
 
 
-def test_recordings_that_were_left_unfinished_are_finished_later(tmp_path, caplog):
-    """By a resumed evaluation, also if no result is missing; no episode is repeated."""
+def test_resume_finishes_recordings_without_repeating_episodes(tmp_path, caplog):
     chunk = tmp_path / "e" / PENDULUM / "seed-005-episode-003"
     blocked = chunk / f"openaigym.trajectories.0.{PENDULUM}-{chunk.name}.h5"
-    policy = Stumbling({3: functools.partial(block, blocked)})
+    policy = FaultyPolicy({3: functools.partial(block, blocked)})
     options = {"policy": policy, "seeds": [5], "num_seeds": None, "episodes": 4}
     results = run(tmp_path / "e", **options).results
     assert blocked.name in caplog.text
@@ -403,20 +383,17 @@ def test_recordings_that_were_left_unfinished_are_finished_later(tmp_path, caplo
     assert not [*finished_trajectories(chunk)]
     blocked.rmdir()
     assert run(tmp_path / "e", **options, resume=True).results == results
-    assert begun(tmp_path / "e") == 4
+    assert started_episodes(tmp_path / "e") == 4
     assert len([*finished_trajectories(chunk)]) == 1
 
 
 # Takes more than five seconds: two evaluations, and a worker that starts again.
 @parametrize("protocol", ["suite", "seeded"])
-def test_a_worker_that_dies_once_costs_nothing(tmp_path, caplog, protocol):
-    """Its job is begun again, and the results are as if it had lived.
-
-    A random stream that episodes share goes on where it was.
-    """
-    kill = functools.partial(kill_worker, tmp_path / "once")
-    once = Stumbling({1: functools.partial(raised, RuntimeError()), 3: kill})
-    options = {"policy": once, **SIXTEEN, "protocol": protocol}
+def test_retry_after_a_dead_worker_gives_the_same_results(tmp_path, caplog, protocol):
+    """A random stream shared by episodes continues where it was."""
+    kill = functools.partial(kill_worker_once, tmp_path / "once")
+    policy = FaultyPolicy({1: functools.partial(fail, RuntimeError()), 3: kill})
+    options = {"policy": policy, **SIXTEEN, "protocol": protocol}
     died = run(tmp_path / "died", **options)
     assert "A worker died" in caplog.text
     lived = run(tmp_path / "lived", **options)
@@ -428,9 +405,8 @@ def test_a_worker_that_dies_once_costs_nothing(tmp_path, caplog, protocol):
 # Takes more than five seconds: three workers die, one after the other.
 @parametrize("workers", [1, 2])
 @pytest.mark.parametrize("protocol", ["seeded", "suite"])
-def test_an_episode_that_kills_its_workers_fails_alone(tmp_path, workers, protocol):
-    """With any number of workers; the others of its chunk are completed."""
-    options = {"policy": Stumbling({3: kill_worker}), "protocol": protocol}
+def test_episode_that_kills_workers_fails_alone(tmp_path, workers, protocol):
+    options = {"policy": FaultyPolicy({3: kill_worker}), "protocol": protocol}
     evaluation = run(tmp_path / "e", **options, **SIXTEEN, workers=workers)
     assert [(each.unit, each.failure) for each in evaluation.failed] == [
         ((5, 3), "3 processes died while running it")
@@ -438,32 +414,25 @@ def test_an_episode_that_kills_its_workers_fails_alone(tmp_path, workers, protoc
     assert {each.unit for each in evaluation.results} == {(5, n) for n in range(16)}
 
 
-def test_an_episode_that_hangs_fails_after_its_time(tmp_path):
-    """The others are completed."""
-    policy = Stumbling({3: functools.partial(time.sleep, 1000)})
+def test_hanging_episode_fails_after_its_timeout(tmp_path):
+    policy = FaultyPolicy({3: functools.partial(time.sleep, 1000)})
     evaluation = run(tmp_path / "e", policy=policy, **SIXTEEN, episode_timeout=2)
     [failed] = evaluation.failed
     assert (failed.unit, failed.failure) == ((5, 3), "it took longer than 2 seconds")
 
 
-class Slow:
-    """A policy that takes its time."""
-
-    def __init__(self, env):
-        self.shape = env.action_space.shape
-
-    def __call__(self, observation):
-        time.sleep(0.03)
-        return np.sin(100 * observation[:1])
+def slow_policy(observation):
+    time.sleep(0.03)
+    return np.sin(100 * observation[:1])
 
 
 def evaluate_slowly(directory, engine, *more):
-    """Evaluate so that there is time to kill it: `more` says whether to resume."""
+    """Evaluate, slowly enough to be killed; resume if `more` is given."""
     workers = {"workers": 2}
     if engine:
         workers = {"engine": getattr(mjrec, engine)(2), "workers": None}
     small = {"episodes": 6, "keep": "best", "resume": bool(more)}
-    tasks, policy = [PENDULUM, DOUBLE], "test_evaluating:Slow"
+    tasks, policy = [PENDULUM, DOUBLE], "test_evaluating:slow_policy"
     run(Path(directory), tasks=tasks, policy=policy, **small, **workers)
 
 
@@ -476,20 +445,19 @@ def slow_run(directory, engine="", *more):
     )
 
 
-def ended(directory):
+def ended_episodes(directory):
     journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
     return sum(path.read_bytes().count(b'"evaluation": {') for path in journals)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """What it gives when nobody kills it."""
+def uninterrupted(tmp_path_factory):
     directory = tmp_path_factory.mktemp("whole") / "e"
     assert slow_run(directory).wait() == 0
     return directory
 
 
-def drawn_in(directory):
+def video_times(directory):
     return {path: path.stat().st_mtime_ns for path in directory.glob("*/*/*.mp4")}
 
 
@@ -503,12 +471,14 @@ def drawn_in(directory):
         ("running", "RayEngine"),
     ],
 )
-def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engine):
-    """SIGKILL of all its processes: the same bytes, and nothing is repeated."""
+def test_resume_after_sigkill_gives_the_same_bytes(
+    uninterrupted, tmp_path, moment, engine
+):
+    """It repeats only the running episodes."""
     killed = tmp_path / "killed"
     process = slow_run(killed, engine)
     if moment == "running":
-        wait_until(lambda: ended(killed) >= 5, seconds=60)
+        wait_until(lambda: ended_episodes(killed) >= 5, seconds=60)
     else:
         wait_until((killed / "results.json").exists, seconds=60)
     for pid in (*children(process.pid), process.pid):
@@ -516,16 +486,17 @@ def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engin
             os.kill(pid, signal.SIGKILL)
     process.wait()
     assert (killed / "results.json").exists() is (moment == "drawing")
-    drawn = drawn_in(killed)
+    before = video_times(killed)
     assert slow_run(killed, engine, "resume").wait() == 0
-    assert contents(killed) == contents(whole)
-    assert recorded_in(read_results(killed)) == recorded_in(read_results(whole))
-    # Each once; those that the two workers were at, once more.
-    assert 24 <= begun(killed) <= 26
-    assert ended(killed) == 24
-    assert len(drawn_in(killed)) == 2
-    assert drawn.items() <= drawn_in(killed).items()
-    # What the killed ones left came into bundles, and is no log any more.
+    assert contents(killed) == contents(uninterrupted)
+    expected = recorded_in(read_results(uninterrupted))
+    assert recorded_in(read_results(killed)) == expected
+    # 24 episodes, and at most one more for each worker.
+    assert 24 <= started_episodes(killed) <= 26
+    assert ended_episodes(killed) == 24
+    assert len(video_times(killed)) == 2
+    assert before.items() <= video_times(killed).items()
+    # Recordings of killed workers are bundled, and their logs deleted.
     kinds = ("openaigym.states.*", "openaigym.trajectory.*")
     assert not [path for kind in kinds for path in killed.rglob(kind)]
     for folder, result in recorded_results(killed):
@@ -534,28 +505,26 @@ def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engin
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         ({"policy": "zero"}, "policy was 'random' and is now 'zero'"),
         ({"episodes": 1}, "episodes was 2 and is now 1"),
         ({"num_seeds": 1}, r"seeds was \[0, 1\] and is now \[0\]"),
         ({"keep": "all"}, "keep was 'none'"),
-        # Though they are the defaults.
+        # The default differs from the plan.
         ({"keep": "best,median,worst"}, "keep was 'none' and is now 'best,median"),
         ({"episodes": 10, "keep": None, "protocol": "suite"}, "episodes was 2"),
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
     ],
 )
-def test_another_evaluation_is_not_gone_on_with(reference, options, what):
-    """The differences are told, and nothing is changed."""
+def test_resume_with_other_options_changes_nothing(reference, options, message):
     before = contents(reference)
-    with pytest.raises(DifferentEvaluation, match=what):
+    with pytest.raises(DifferentEvaluation, match=message):
         run(reference, tasks=[PENDULUM, DOUBLE], resume=True, **options)
     assert contents(reference) == before
 
 
-def test_a_directory_belongs_to_one_evaluation(reference, tmp_path):
-    """It is not begun over another, nor over anything else, nor while one is at it."""
+def test_directory_belongs_to_one_evaluation(reference, tmp_path):
     with pytest.raises(InvalidArgument, match="resume=True"):
         run(reference)
     (tmp_path / "notes.txt").touch()
@@ -595,10 +564,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("options", "kind", "words"), WRONG)
-def test_what_cannot_be_is_told_before_anything_is_written(
-    tmp_path, monkeypatch, options, kind, words
-):
-    """As the error that it is, with a way out."""
+def test_invalid_options_write_nothing(tmp_path, monkeypatch, options, kind, words):
     (tmp_path / "broken_policy.py").write_text("undefined\n")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(kind, match=words):
@@ -606,12 +572,12 @@ def test_what_cannot_be_is_told_before_anything_is_written(
     assert not (tmp_path / "e").exists()
 
 
-FLAT_WORLD = """
+LIVE_ENVIRONMENT = """
 import gymnasium
 import numpy as np
 from conftest import Corridor
 
-class FlatWorld(Corridor):
+class Noise(Corridor):
     def step(self, action):
         observation, _, *ends = super().step(action)
         return observation, float(action), *ends
@@ -619,18 +585,15 @@ class FlatWorld(Corridor):
     def render(self):
         return self.np_random.integers(255, size=(32, 32, 3), dtype=np.uint8)
 
-gymnasium.register("FlatWorld-v0", FlatWorld)
+gymnasium.register("Noise-v0", Noise)
 """
 
 
-def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
-    tmp_path, monkeypatch
-):
-    """By the rule, as of what is drawn later; each in an environment of its own."""
-    (tmp_path / "flat_world.py").write_text(FLAT_WORLD)
+def test_keep_deletes_other_live_videos(tmp_path, monkeypatch):
+    (tmp_path / "live.py").write_text(LIVE_ENVIRONMENT)
     monkeypatch.chdir(tmp_path)
-    four = {"num_seeds": 1, "episodes": 4, "keep": "best,worst"}
-    live = {"tasks": ["flat_world:FlatWorld-v0"], "height": None, "width": None, **four}
+    live = {"tasks": ["live:Noise-v0"], "height": None, "width": None}
+    live |= {"num_seeds": 1, "episodes": 4, "keep": "best,worst"}
     one = run(tmp_path / "one", **live, workers=1)
     assert one.pending == {}
     assert len(one.videos) == 2
@@ -638,40 +601,38 @@ def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
     assert listed_in(tmp_path / "one") == {path.name for path in one.videos}
     two = run(tmp_path / "two", **live)
     assert [p.read_bytes() for p in two.videos] == [p.read_bytes() for p in one.videos]
-    assert one.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
+    assert one.plan.tasks[0].folder == "live%3ANoise-v0"
 
 
-def test_what_cannot_be_drawn_has_results_without_videos(tmp_path, caplog):
-    """And one line says why; nothing fails, and nothing stays pending."""
-    is_drawn = importlib.util.find_spec("pygame") is not None
+def test_unrenderable_tasks_have_results_without_videos(tmp_path, caplog):
+    """One line says why, and no video stays pending."""
+    is_rendered = importlib.util.find_spec("pygame") is not None
     evaluation = run(
         tmp_path / "e", tasks=["CartPole-v1"], keep="best", height=None, width=None
     )
     assert not evaluation.failed
-    assert len(evaluation.videos) == is_drawn
+    assert len(evaluation.videos) == is_rendered
     assert not evaluation.pending
-    # Nor is any announced.
-    assert len(evaluation.selection["CartPole-v1"]) == is_drawn
-    assert len(read_results(tmp_path / "e").by_task["CartPole-v1"].videos) == is_drawn
-    said = [r.message for r in caplog.records if "will have no videos" in r.message]
-    assert len(said) == (not is_drawn)
+    assert len(evaluation.selection["CartPole-v1"]) == is_rendered
+    columns = read_results(tmp_path / "e").by_task["CartPole-v1"]
+    assert len(columns.videos) == is_rendered
+    assert caplog.text.count("will have no videos") == (not is_rendered)
 
 
-def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path):
-    """After more seeds were asked for; those of before stay."""
+def test_more_seeds_can_select_other_videos(tmp_path):
+    """These are rendered from trajectories, and earlier videos stay."""
     options = {"keep": "median", "tasks": [DOUBLE], "episodes": 1}
-    before = run(tmp_path / "e", **options, num_seeds=2)
-    [first] = before.videos
-    stamps = {path: path.stat().st_mtime_ns for path in before.directory.rglob("*.mp4")}
+    [first] = run(tmp_path / "e", **options, num_seeds=2).videos
+    earlier = video_times(tmp_path / "e")
     for count in range(3, 9):
         after = run(tmp_path / "e", **options, num_seeds=count, resume=True)
         if after.videos != [first]:
             break
     assert after.pending == {}
-    [newly] = after.videos
-    assert newly != first
-    assert all(path.stat().st_mtime_ns == stamps[path] for path in stamps)
-    assert newly.name in listed_in(tmp_path / "e")
+    [video] = after.videos
+    assert video != first
+    assert earlier.items() <= video_times(tmp_path / "e").items()
+    assert video.name in listed_in(tmp_path / "e")
 
 
 ROBOT = """
@@ -680,9 +641,7 @@ ROBOT = """
 """
 
 
-class Weighted:
-    """A policy with a weight."""
-
+class ConstantPolicy:
     def __init__(self, weight):
         self.weight = weight
 
@@ -690,14 +649,14 @@ class Weighted:
         return np.full(1, self.weight)
 
 
-def test_another_policy_is_not_gone_on_with(tmp_path, monkeypatch):
-    """Other weights, other code of a module, another file that an argument names."""
-    place = tmp_path / "e"
-    run(place, policy=Weighted(0.0), seeds=[0], num_seeds=None)
+def test_resume_with_another_policy_is_refused(tmp_path, monkeypatch):
+    """The policy includes weights, code and files named by arguments."""
+    directory = tmp_path / "e"
+    run(directory, policy=ConstantPolicy(0.0), seeds=[0], num_seeds=None)
     options = {"seeds": [0, 1], "num_seeds": None, "resume": True}
     with pytest.raises(DifferentEvaluation, match=r"policy \(its content\) was '\w+"):
-        run(place, policy=Weighted(0.9), **options)
-    assert len(run(place, policy=Weighted(0.0), **options).results) == 4
+        run(directory, policy=ConstantPolicy(0.9), **options)
+    assert len(run(directory, policy=ConstantPolicy(0.0), **options).results) == 4
     monkeypatch.chdir(tmp_path)
     module, weights = tmp_path / "own_policy.py", tmp_path / "weights.bin"
     module.write_text("def make(env, weights):\n    return lambda o: [0.0]\n")
@@ -712,8 +671,7 @@ def test_another_policy_is_not_gone_on_with(tmp_path, monkeypatch):
         run(tmp_path / "named", **named, resume=True)
 
 
-def test_what_policy_and_file_refer_to_is_compared_too(tmp_path, monkeypatch):
-    """A module that the policy imports, and the model that an MJCF file compiles to."""
+def test_resume_compares_imported_modules_and_compiled_models(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     helper, robot = tmp_path / "own_gains.py", tmp_path / "robot.xml"
     text = f"import {helper.stem}\ndef act(o):\n    return [{helper.stem}.GAIN]\n"
@@ -724,7 +682,7 @@ def test_what_policy_and_file_refer_to_is_compared_too(tmp_path, monkeypatch):
     run(tmp_path / "e", **options, num_seeds=1)
     helper.write_text("GAIN = 1.0\n")
     robot.write_text(ROBOT.replace('"slide"', '"hinge"'))
-    # Where nothing is left to run, nothing can be mixed.
+    # A complete evaluation can be read with either.
     assert len(run(tmp_path / "e", **options, num_seeds=1, resume=True).results) == 1
     with pytest.raises(DifferentEvaluation) as raised:
         run(tmp_path / "e", **options, resume=True)
@@ -737,40 +695,39 @@ def test_what_policy_and_file_refer_to_is_compared_too(tmp_path, monkeypatch):
     assert contents(tmp_path / "e") == contents(tmp_path / "whole")
 
 
-def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):
-    """What is to be more is given; what is done is not done again."""
-    place = tmp_path / "e"
-    run(place, num_seeds=1, episodes=1)
-    same = evaluate(directory=place, resume=True, workers=1)
+def test_resume_takes_the_plan_from_the_directory(reference, tmp_path):
+    """Larger values extend it, and completed episodes are not repeated."""
+    directory = tmp_path / "e"
+    run(directory, num_seeds=1, episodes=1)
+    same = evaluate(directory=directory, resume=True, workers=1)
     assert [each.unit for each in same.results] == [(0, 0)]
     more = {"tasks": [PENDULUM, DOUBLE], "num_seeds": 2, "episodes": 2}
-    evaluate(**more, directory=place, resume=True, workers=1)
-    assert contents(place) == contents(reference)
-    (place / "results.json").unlink()
-    evaluate(directory=place, resume=True, workers=1)
-    assert contents(place) == contents(reference)
-    assert begun(place) == 8
+    evaluate(**more, directory=directory, resume=True, workers=1)
+    assert contents(directory) == contents(reference)
+    (directory / "results.json").unlink()
+    evaluate(directory=directory, resume=True, workers=1)
+    assert contents(directory) == contents(reference)
+    assert started_episodes(directory) == 8
 
 
-def test_going_on_keeps_ranges_and_confidence(tmp_path):
-    """Unless others are given; then the rest stays."""
-    place, least = tmp_path / "e", {"directory": tmp_path / "e", "workers": 1}
-    run(place, score_ranges={PENDULUM: (0, 10)}, confidence=0.8, num_seeds=1)
-    before = contents(place)
-    evaluate(**least, resume=True)
-    assert contents(place) == before
-    changed = evaluate(**least, resume=True, confidence=0.9)
+def test_resume_keeps_ranges_and_confidence_unless_given(tmp_path):
+    directory = tmp_path / "e"
+    run(directory, score_ranges={PENDULUM: (0, 10)}, confidence=0.8, num_seeds=1)
+    before = contents(directory)
+    resume = functools.partial(evaluate, directory=directory, workers=1, resume=True)
+    resume()
+    assert contents(directory) == before
+    changed = resume(confidence=0.9)
     assert changed.bootstrap.confidence == 0.9
     assert changed.summaries[0].score_range == (0, 10)
-    ranges = {PENDULUM: (0, 5)}
-    changed = evaluate(**least, resume=True, score_ranges=ranges)
+    changed = resume(score_ranges={PENDULUM: (0, 5)})
     assert changed.bootstrap.confidence == 0.9
     assert changed.summaries[0].score_range == (0, 5)
 
 
 @pytest.mark.parametrize(("first", "others"), [(30, (60, None)), (None, (60,))])
-def test_going_on_with_another_frame_rate_is_refused(tmp_path, first, others):
-    """Though it is the default, or none; without one, the first is kept."""
+def test_resume_with_another_frame_rate_is_refused(tmp_path, first, others):
+    """Without one, the first is kept."""
     run(tmp_path / "e", max_fps=first, num_seeds=1, episodes=1)
     for other in others:
         with pytest.raises(DifferentEvaluation, match=f"max_fps was {first}.*{other}"):
@@ -779,8 +736,7 @@ def test_going_on_with_another_frame_rate_is_refused(tmp_path, first, others):
     assert same.plan.max_fps == first
 
 
-def test_force_deletes_the_evaluation_that_is_there(tmp_path):
-    """And nothing else."""
+def test_force_deletes_only_files_of_the_evaluation(tmp_path):
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE])
     (tmp_path / "e" / DOUBLE / "notes.txt").touch()
     run(tmp_path / "e", force=True, num_seeds=1)
@@ -788,8 +744,8 @@ def test_force_deletes_the_evaluation_that_is_there(tmp_path):
     assert len(list(read_results(tmp_path / "e"))) == 2
 
 
-class Counted:
-    """Writes down how many threads libraries take, each time that it is built."""
+class CountedPolicy:
+    """Appends libraries' number of threads to a file when it is built."""
 
     def __init__(self, env, file):
         with Path(file).open("a") as built:
@@ -799,15 +755,16 @@ class Counted:
         return np.zeros(1)
 
 
-def test_a_policy_is_built_once_for_each_worker_and_task(tmp_path):
-    """Whatever the number of chunks. Results depend on no machine's number of CPUs."""
-    counted = {"policy": Counted, "policy_kwargs": {"file": str(tmp_path / "built")}}
-    run(tmp_path / "e", **counted, num_seeds=8, workers=1)
+def test_policy_is_built_once_per_worker_and_task(tmp_path):
+    """It uses one thread, so results do not depend on the number of CPUs."""
+    kwargs = {"file": str(tmp_path / "built")}
+    options = {"policy": CountedPolicy, "policy_kwargs": kwargs}
+    run(tmp_path / "e", **options, num_seeds=8, workers=1)
     assert (tmp_path / "built").read_text() == "1"
 
 
 @pytest.mark.dm_control
-def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path):
+def test_time_limit_sets_the_score_range(tmp_path):
     """A task of 40 steps has returns from 0 to 40."""
     pytest.importorskip("dm_control")
     kwargs = {"task_kwargs": {"time_limit": 1}}

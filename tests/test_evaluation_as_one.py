@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An evaluation's directory is one thing for the commands that take recordings."""
+"""Commands that take recordings treat an evaluation's directory as one recording."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ TASKS = ("InvertedPendulum-v5", "InvertedDoublePendulum-v5")
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    """Two tasks with two seeds each, one of which is drawn."""
+    """Two tasks with two seeds each, and a video of the best episode."""
     directory = tmp_path_factory.mktemp("evaluations") / "e"
     few = {"policy": "random", "num_seeds": 2, "episodes": 1, "keep": "best"}
     small = {"max_steps": 3, "height": 32, "width": 32, "workers": 1}
@@ -28,24 +28,24 @@ def evaluation(tmp_path_factory):
 
 
 # Takes more than five seconds: five processes, which load simulators.
-def test_it_is_packed_and_verified_as_one(evaluation, tmp_path):
-    """One archive with a file for each trajectory, each model once, one verdict."""
+def test_evaluation_is_packed_and_verified_as_one(evaluation, tmp_path):
+    """The archive has a file for each trajectory and one verdict."""
     archive = mjrec.pack(evaluation, tmp_path / "e.zip")
     names = [Path(name).name for name in zipfile.ZipFile(archive).namelist()]
     assert sum(name.startswith("openaigym.trajectory.") for name in names) == 4
     assert not any(name.startswith("openaigym.trajectories.") for name in names)
     assert sum(name.startswith("openaigym.model.") for name in names) == 4
     assert mjrec.verify(archive).verdict is Verdict.PASS
-    for given in (archive, evaluation):
-        verification = mjrec.verify(given, level="physics")
+    for path in (archive, evaluation):
+        verification = mjrec.verify(path, level="physics")
         assert verification.verdict is Verdict.PARTLY
         assert not verification.excuses
         counts = {str(each.topic): each.count for each in verification.findings}
         assert counts["physics"] == 12
 
 
-def test_an_unfinished_evaluation_says_so(evaluation, tmp_path, caplog):
-    """When it is packed, in the README, and in the first line of a verification."""
+def test_missing_episodes_are_counted(evaluation, tmp_path, caplog):
+    """A warning, the README and the first line of a verification name them."""
     directory = shutil.copytree(evaluation, tmp_path / "begun")
     plan = json.loads((directory / "evaluation.json").read_text())
     plan["plan"]["seeds"].append(2)
@@ -55,13 +55,12 @@ def test_an_unfinished_evaluation_says_so(evaluation, tmp_path, caplog):
     assert "has 4 of 6 episodes" in caplog.text
     with zipfile.ZipFile(archive) as packed:
         assert "**4 of 6 planned episodes" in packed.read("e/data/README.md").decode()
-    for given in (archive, directory):
-        first, *_ = remarks(mjrec.verify(given, level="stats"))
+    for path in (archive, directory):
+        first, *_ = remarks(mjrec.verify(path, level="stats"))
         assert first.startswith("4 of 6 episodes")
 
 
-def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_path):
-    """Each directory counts its own; and each has names of its own."""
+def test_several_directories_need_all_episodes_and_unique_names(evaluation, tmp_path):
     with pytest.raises(InvalidArgument, match="contains 4 monitor directories"):
         mjrec.pack(evaluation, tmp_path / "e.zip", episodes=[0])
     folders = sorted(evaluation.glob("*/seed-000"))
@@ -75,19 +74,19 @@ def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_pat
         mjrec.pack(tmp_path / "both", tmp_path / "e.zip")
 
 
-def test_it_is_listed_and_drawn_as_one(evaluation, capsys):
-    """Also one episode of each task and seed, another way, and a single one by name."""
+def test_evaluation_is_listed_and_rendered_as_one(evaluation, capsys):
+    """A number selects an episode of each task and seed, a file name one."""
     assert commands.main(["list", str(evaluation), "--json"]) == 0
     listed = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [(each["task"], each["seed"]) for each in listed] == [
         (task, seed) for task in TASKS for seed in range(2)
     ]
     assert sum(each["video"] is not None for each in listed) == 2
-    another = ["--size", "16x16", "--workers", "1", "--json"]
-    render = ["render", str(evaluation), "--episode", "0", *another]
+    options = ["--size", "16x16", "--workers", "1", "--json"]
+    render = ["render", str(evaluation), "--episode", "0", *options]
     assert commands.main(render) == 0
-    drawn = json.loads(capsys.readouterr().out)
-    paths = {Path(drawn["directory"], each["name"]) for each in drawn["videos"]}
+    rendered = json.loads(capsys.readouterr().out)
+    paths = {Path(rendered["directory"], each["name"]) for each in rendered["videos"]}
     assert len(paths) == 4
     assert all(path.is_file() for path in paths)
     [bundle] = evaluation.glob(f"{TASKS[0]}/seed-001/openaigym.trajectories.*.h5")

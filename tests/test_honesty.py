@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What inputs say of their author."""
+"""Remarks on inputs that an author may have chosen."""
 
 import numpy as np
 import pytest
@@ -29,15 +29,15 @@ def evaluated(number, of, **inputs):
     return episode(number, evaluation={"seed": 2, "episode": of}, **inputs)
 
 
-def said(*recordings):
-    """Return what is said of them; of arrays of one first letter is one content."""
+def found(*recordings):
+    """Return the remarks; arrays whose names share the first letter are equal."""
     names = [e.arrays for each in recordings for e in each.episodes if e.arrays]
     arrays = {name: np.full(3, ord(name[0])) for name in names}
     return list(remarks(Inputs(recordings=recordings), arrays))
 
 
 def seed_of(run, number):
-    """Return the seed that the stated rule gives."""
+    """Return an episode's seed by the stated rule."""
     return episode_seeds(run, number).environment
 
 
@@ -62,27 +62,28 @@ CHOSEN = "seeds chosen by the author"
     ],
 )
 def test_seeds_follow_a_stated_rule_or_are_the_authors(episodes, rule):
-    """From the first episode of the recording on."""
-    [finding] = said(recording(0, *episodes, options={"seed": 5}))
+    [finding] = found(recording(0, *episodes, options={"seed": 5}))
     assert rule in finding.reason
     assert finding.outcome is NOTED
 
 
-FIRST = recording(0, episode(0))
-EASIER = {"environment": {"id": "Easier-v0"}}
+def named(env_id, environment):
+    return recording(0, episode(0), env_id=env_id, environment=environment)
+
+
 HOPPER = {"id": "Hopper-v5"}
 
 
 @pytest.mark.parametrize(
     ("recordings", "outcome", "reason"),
     [
-        # An episode that is not there is no episode of a whole recording.
+        # A complete recording has all episodes.
         ([recording(0, episode(0), episode(1), episode(4))], DIFFERENT, "ing: 2, 3"),
-        # Nor are those of a monitor that this one went on from.
+        # Episodes of the resumed monitor are missing too.
         ([recording(0, episode(2), first_episode_id=2)], BELIEVED, "0, 1 are missing"),
-        # They are in no statistics.
+        # Statistics leave these episodes out.
         ([recording(0, episode(0), episode(1, cut="reset"))], NOTED, "cut off: 1"),
-        # An author who resumes can drop each episode that goes wrong.
+        # By resuming, an author can drop bad episodes.
         (
             [
                 recording(0, episode(0), episode(1, cut="close")),
@@ -91,13 +92,13 @@ HOPPER = {"id": "Hopper-v5"}
             BELIEVED,
             "continues after them",
         ),
-        # An average over the others would leave them out.
+        # Averages may leave out episodes of one type.
         (
             [recording(0, episode(0, type="t"), episode(1, type="e"))],
             NOTED,
             "1 of 2 episodes are labeled training",
         ),
-        # The best of many would be a choice; chunks count together.
+        # An author may choose the best episodes; chunks count together.
         (
             [
                 recording(0, evaluated(0, 0), evaluated(1, 1)),
@@ -106,8 +107,7 @@ HOPPER = {"id": "Hopper-v5"}
             BELIEVED,
             "3, 4",
         ),
-        # Other actions, or another beginning, are another episode if nothing is known
-        # of their states.
+        # Without states, equal seeds and actions are a repeated episode.
         (
             [
                 recording(0, episode(0, seed=1, arrays="a"), episode(1, arrays="a2")),
@@ -116,7 +116,7 @@ HOPPER = {"id": "Hopper-v5"}
             BELIEVED,
             "episode 0 of 0.1, episode 0 of 1.1",
         ),
-        # Other actions that lead to the same states are not.
+        # Equal states are a repeated episode, with any seeds and actions.
         (
             [
                 recording(0, episode(0, seed=1, arrays="a", played="x")),
@@ -126,46 +126,26 @@ HOPPER = {"id": "Hopper-v5"}
             BELIEVED,
             "episode 0 of 0.1, episode 0 of 1.1;",
         ),
-        # All files bear the name, and another environment was run.
-        ([recording(0, episode(0), env_id="ours", environment=HOPPER)], BELIEVED, ""),
-        (
-            [recording(0, episode(0), env_id="Humanoid-v5", environment=HOPPER)],
-            DIFFERENT,
-            "",
-        ),
-        (
-            [
-                recording(
-                    0,
-                    episode(0),
-                    env_id="Hopper-v5",
-                    environment={**HOPPER, "framework": "mjcf"},
-                )
-            ],
-            NOTED,
-            "",
-        ),
+        # Files may be named after another environment.
+        ([named("ours", HOPPER)], BELIEVED, ""),
+        ([named("Humanoid-v5", HOPPER)], DIFFERENT, ""),
+        ([named("Hopper-v5", {**HOPPER, "framework": "mjcf"})], NOTED, ""),
     ],
 )
-def test_what_makes_a_run_look_better_is_in_the_first_lines(
-    recordings, outcome, reason
-):
-    """One line for each thing that its author may have chosen."""
-    [finding] = [each for each in said(*recordings) if each.is_headline]
+def test_flattering_choices_are_in_the_first_lines(recordings, outcome, reason):
+    [finding] = [each for each in found(*recordings) if each.is_headline]
     assert finding.outcome is outcome
     assert reason in finding.reason
 
 
-def test_a_predecessor_that_is_there_is_none_that_is_missing():
-    """But for one of another environment, which stands in for nothing."""
+def test_resumed_monitor_of_the_same_environment_is_not_missing():
     second = recording(1, episode(1), first_episode_id=1)
-    assert said(FIRST, second) == []
-    found = said(recording(0, episode(0), **EASIER), second)
-    assert any("0 are missing" in each.reason for each in found)
+    assert found(recording(0, episode(0)), second) == []
+    findings = found(named("A-v0", {"id": "Easier-v0"}), second)
+    assert any("0 are missing" in each.reason for each in findings)
 
 
-def test_huge_numbers_take_no_memory():
-    """A stranger's archive may have any."""
-    [gap, absent] = said(recording(0, episode(10**15), first_episode_id=10**14))
+def test_huge_episode_numbers_take_no_memory():
+    [gap, absent] = found(recording(0, episode(10**15), first_episode_id=10**14))
     assert "and 899999999999995 more" in gap.reason
     assert absent.count == 10**14

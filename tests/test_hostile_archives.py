@@ -53,8 +53,8 @@ def damage(change, path):
 
 
 def declare_size(size, data):
-    for place in (22, data.index(TABLE) + 24):
-        struct.pack_into("<L", data, place, size)
+    for offset in (22, data.index(TABLE) + 24):
+        struct.pack_into("<L", data, offset, size)
 
 
 def encrypt(data):
@@ -78,7 +78,7 @@ def write_bomb(path):
 
 
 def write_overlapping(path):
-    """Write two entries over the same bytes, as bombs do."""
+    """Write two entries that share bytes, as zip bombs do."""
     write(path, ("run/data/a", b"1"), ("run/data/b", b"2"))
     data = bytearray(path.read_bytes())
     struct.pack_into("<L", data, data.rindex(TABLE) + 42, 0)
@@ -86,7 +86,7 @@ def write_overlapping(path):
 
 
 def write_two_tables(path):
-    """Hide the table that Python reads from other programs."""
+    """Write a table for Python and another for other programs."""
     evil = "run/data/evil"
     begin = 30 + len(NAME) + 1  # the second file, which holds the visible table
     table = begin + 30 + len(evil)
@@ -95,15 +95,15 @@ def write_two_tables(path):
     extra = struct.pack("<2H", 0x5455, rest)
     seen = listing(NAME, b"1", 0, len(extra) + rest) + extra
     hidden = listing(NAME, b"1", 0) + listing(evil, seen, begin)
-    place = table + len(seen)
-    large = (b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, place)
+    offset = table + len(seen)
+    large = (b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, offset)
     end = (b"PK\5\6", 0, 0, 1, 1, len(seen) + rest, table, 0)
     path.write_bytes(
         stored(NAME, b"1")
         + stored(evil, seen)
         + hidden
         + struct.pack("<4sQ2H2L4Q", *large)
-        + struct.pack("<4sLQL", b"PK\6\7", 0, place + hidden_size, 1)
+        + struct.pack("<4sLQL", b"PK\6\7", 0, offset + hidden_size, 1)
         + struct.pack("<4s4H2LH", *end)
     )
 
@@ -137,7 +137,7 @@ def link_folder(path):
 
 
 NAMES = [
-    # They lead elsewhere on some system.
+    # Paths that lead outside on some system.
     *(("../evil", "leads out"), ("run/../../evil", "leads out")),
     *(("run/..", "leads out"), (str(OUTSIDE), "absolute")),
     *(("C:/evil", "absolute"), ("run\\..\\..\\evil", "backslash")),
@@ -147,7 +147,7 @@ NAMES = [
     (f"run/{'e/' * 20}e", "folders deep"),
 ]
 PAIRS = [
-    # Two files of one name on some system, or more than one folder.
+    # Names of the same file on some system, or several top folders.
     *(("run/data/a", "run/data/a", "same file"), ("run/data/a", "run/data/A", "same")),
     ("run/data/\u00e4", "run/data/a\u0308", "same file"),
     *(("run/data/a", "run/data/a/b", "the folder"), ("run/data/a", "a", "one folder")),
@@ -157,7 +157,7 @@ DAMAGES = [
     (partial(declare_size, 5), "CRC"),
     (partial(declare_size, 5000), "the declared size"),
     *((encrypt, "encrypted"), (flip_bit, "CRC")),
-    # Bytes that some programs read and others skip.
+    # Bytes that only some programs read.
     (insert_bytes, "hidden bytes"),
     (lambda data: b"evil" + data, "before its first file"),
     (lambda data: data + b"evil", "at its end"),
@@ -191,20 +191,19 @@ ATTACKS = [
     ids=[f"{n} {why}" for n, (_, why) in enumerate(ATTACKS)],
 )
 def test_malicious_archive_is_refused(make, reason, tmp_path):
-    """Nothing is written outside its folder."""
-    archive, place = tmp_path / "run.zip", tmp_path / "place"
+    """It writes nothing outside its folder."""
+    archive, folder = tmp_path / "run.zip", tmp_path / "folder"
     make(archive)
     before = sorted(tmp_path.rglob("*"))
-    place.mkdir()
+    folder.mkdir()
     with pytest.raises(mjrec.UnreadableArchive, match=reason):
-        bring_in(archive, place / "given")
-    outside = [path for path in tmp_path.rglob("*") if place not in path.parents]
-    assert sorted(outside) == sorted([*before, place])
+        bring_in(archive, folder / "run")
+    outside = [path for path in tmp_path.rglob("*") if folder not in path.parents]
+    assert sorted(outside) == sorted([*before, folder])
     assert not OUTSIDE.exists()
 
 
-def test_verification_refuses_malicious_archives(tmp_path, monkeypatch):
-    """It leaves no files, and the error says what to do."""
+def test_verification_of_a_malicious_archive_leaves_no_files(tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -226,5 +225,5 @@ def test_archive_larger_than_the_free_disk_is_refused(tmp_path, monkeypatch):
     usage = type("Usage", (), {"free": 999})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
     with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, but only 999 are free"):
-        bring_in(path, tmp_path / "given")
-    assert not (tmp_path / "given").exists()
+        bring_in(path, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a run: read from what it recorded, and nothing more."""
+"""The inputs of a run, read from its recordings."""
 
 import dataclasses
 import json
@@ -25,22 +25,22 @@ from mjrec.recorder.options import RecorderOptions
 
 # Options of the recorder that are no inputs, with the reason.
 OTHERS = {
-    "given otherwise": "video_callable keep mode trajectory_callable statements",
-    "how it records, not what": "workers tail_bytes on_error strict trackers resume",
-    "what must be there before, or may happen": "force uid allow_early_reset",
-    "statistics while it runs": "write_upon_reset episode_info",
-    "a fact for the manifest": "policy_file",
+    "other fields of inputs": "video_callable keep mode trajectory_callable statements",
+    "no effect on content": "workers tail_bytes on_error strict trackers resume",
+    "conditions of starting": "force uid allow_early_reset",
+    "statistics during the run": "write_upon_reset episode_info",
+    "manifest": "policy_file",
 }
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """What would be in a packed run: a recording with all that is unusual."""
-    place = tmp_path_factory.mktemp("inputs")
+    """The data folder of a packed run with unusual inputs."""
+    data = tmp_path_factory.mktemp("inputs")
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4, frame_skip=3)
     options = {"mode": "evaluation", "fps": 29.97, "workers": 0}
     with mjrec.Monitor(
-        env, place / "recordings", lambda episode: episode == 1, **options
+        env, data / "recordings", lambda episode: episode == 1, **options
     ) as monitor:
         actions = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
         monitor.reset(seed=3, options={"a": 1})
@@ -51,14 +51,11 @@ def data(tmp_path_factory):
         monitor.reset()
         for action in (actions[0], actions[0], actions[3], actions[3]):
             monitor.step(action)
-    return place
+    return data
 
 
-def test_inputs_are_what_was_asked_for_and_done(data, tmp_path):
-    """Environment, options, seeds, actions and what cut an episode off.
-
-    They go through a folder unchanged, without pickles.
-    """
+def test_inputs_are_read_from_recordings_and_files(data, tmp_path):
+    """A folder keeps them unchanged, without pickles."""
     inputs, arrays = read_inputs(data)
     [recording] = inputs.recordings
     assert recording.options == {"fps": "29.97"}
@@ -67,25 +64,25 @@ def test_inputs_are_what_was_asked_for_and_done(data, tmp_path):
     assert (second.seed, second.cut, second.is_chosen) == (None, None, True)
     assert [a.tolist() for a in arrays[second.arrays]][2:] == [[1.0], [1.0]]
     inputs.write(tmp_path, arrays)
-    again = Inputs.read(tmp_path)
-    assert again.unusual() == inputs.unusual()
-    texts = [json.dumps(dataclasses.asdict(each)) for each in (again, inputs)]
+    copy = Inputs.read(tmp_path)
+    assert copy.unusual() == inputs.unusual()
+    texts = [json.dumps(dataclasses.asdict(each)) for each in (copy, inputs)]
     assert texts[0] == texts[1]
     with np.load(tmp_path / ARRAYS_FILE, allow_pickle=False) as read:
         assert set(read) == set(arrays)
 
 
-def test_actions_are_played_as_they_were_given(data):
-    """Where float32 became float64 in mid-episode, and where one fits nowhere."""
+def test_actions_keep_their_type_and_shape(data):
+    """Types may change within an episode, and an action may not fit the space."""
     inputs, arrays = read_inputs(data)
     first, second = inputs.recordings[0].episodes
     played = list(given_actions(second, arrays))
     assert [each.dtype.name for each in played] == ["float32"] * 2 + ["float64"] * 2
     assert played[0][0] == np.float32(0.1)
     irregular = {"step": 1, "value": [[1.0], [2.0]], "dtype": "float32"}
-    odd = dataclasses.replace(first, irregular=(irregular,))
-    whole = list(given_actions(odd, arrays))[1]
-    assert (whole.dtype.name, whole.shape) == ("float32", (2, 1))
+    changed = dataclasses.replace(first, irregular=(irregular,))
+    action = list(given_actions(changed, arrays))[1]
+    assert (action.dtype.name, action.shape) == ("float32", (2, 1))
     # Dictionaries are recorded as one vector.
     parts = {"arrays": "a", "action_parts": [("x", [2]), ("y", [])]}
     vector = {"a": np.array([[1.0, 2.0, 3.0]])}
@@ -93,13 +90,12 @@ def test_actions_are_played_as_they_were_given(data):
     assert (action["x"].tolist(), action["y"]) == ([1.0, 2.0], 3.0)
 
 
-def test_unusual_inputs_are_listed(data):
-    """For the report: all that is not the default."""
+def test_inputs_other_than_defaults_are_listed(data):
     inputs, _ = read_inputs(data)
     packed = dataclasses.replace(inputs, packing={"anonymous": True, "name": "run"})
-    said = packed.unusual()
-    assert said.pop("pack") == {"anonymous": True}
-    [recording] = said.values()
+    unusual = packed.unusual()
+    assert unusual.pop("pack") == {"anonymous": True}
+    [recording] = unusual.values()
     assert recording["environment: frame_skip"] == 3
     assert recording["max_episode_steps"] == 4
     assert recording["fps"] == "29.97"
@@ -112,8 +108,7 @@ def test_unusual_inputs_are_listed(data):
     ("schedule", "rule"),
     [("disable_videos", None), ("disable_videos", "best:1"), ("record_all", None)],
 )
-def test_the_view_is_listed_if_there_may_be_videos(schedule, rule):
-    """Without any, it changed nothing."""
+def test_view_options_are_listed_if_there_may_be_videos(schedule, rule):
     kwargs = {"render_mode": "rgb_array", "width": 32, "frame_skip": 3}
     environment = {"id": "A-v0", "framework": "gymnasium", "kwargs": kwargs}
     recording = RecordingInputs(
@@ -124,15 +119,14 @@ def test_the_view_is_listed_if_there_may_be_videos(schedule, rule):
         schedule=schedule,
         rule=rule,
     )
-    [said] = Inputs(recordings=[recording]).unusual().values()
-    assert {"environment: frame_skip", "observations"} <= said.keys()
+    [unusual] = Inputs(recordings=[recording]).unusual().values()
+    assert {"environment: frame_skip", "observations"} <= unusual.keys()
     view = {"environment: render_mode", "environment: width", "camera"}
     is_listed = (schedule, rule) != ("disable_videos", None)
-    assert view & said.keys() == (view if is_listed else set())
+    assert view & unusual.keys() == (view if is_listed else set())
 
 
 def test_wrappers_are_listed_with_their_arguments():
-    """Gymnasium's own can give any reward."""
     environment = {
         "id": "A-v0",
         "framework": "mjcf",
@@ -140,10 +134,10 @@ def test_wrappers_are_listed_with_their_arguments():
         "wrapper_arguments": [{"min_reward": 100.0}, None],
     }
     recording = RecordingInputs(infix="0.u", env_id="A-v0", environment=environment)
-    [said] = Inputs(recordings=[recording]).unusual().values()
-    assert said["environment"] == "A-v0, the author's own model (MJCF)"
+    [unusual] = Inputs(recordings=[recording]).unusual().values()
+    assert unusual["environment"] == "A-v0, the author's own model (MJCF)"
     listed = ["gymnasium.ClipReward(min_reward=100.0)", "mine.Wrapper(...)"]
-    assert said["wrappers"] == listed
+    assert unusual["wrappers"] == listed
 
 
 @pytest.mark.parametrize(
@@ -155,19 +149,18 @@ def test_wrappers_are_listed_with_their_arguments():
         lambda run: run.update(first_episode_id="0"),
     ],
 )
-def test_what_is_no_input_is_refused(change, data, tmp_path):
-    """The list is closed, and each has its type."""
+def test_unknown_options_and_wrong_types_are_refused(change, data, tmp_path):
     shutil.copytree(data / "recordings", tmp_path / "recordings")
     journal = the(tmp_path, "*.jsonl")
     first, *others = journal.read_text().splitlines()
-    said = json.loads(first)
-    change(said["run"])
-    journal.write_text("\n".join([json.dumps(said), *others, ""]))
+    event = json.loads(first)
+    change(event["run"])
+    journal.write_text("\n".join([json.dumps(event), *others, ""]))
     with pytest.raises(Error, match="inputs cannot be read"):
         read_inputs(tmp_path)
 
 
-def test_each_option_is_an_input_or_has_a_reason_not_to_be():
+def test_all_other_options_have_a_reason():
     """An option that changes files, and is not an input, would never verify."""
     fields = {field.name for field in dataclasses.fields(RecorderOptions)}
     others = {name for names in OTHERS.values() for name in names.split()}

@@ -41,8 +41,8 @@ mjrec.evaluate(
 """
 
 
-def test_a_policy_of_a_script_is_the_same_in_its_next_process(tmp_path):
-    """Its sets have another order there, and more modules are imported."""
+def test_policy_of_a_script_has_the_same_digest_in_its_next_process(tmp_path):
+    """There, sets have another order, and more modules are imported."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
 
@@ -58,8 +58,8 @@ def test_a_policy_of_a_script_is_the_same_in_its_next_process(tmp_path):
     assert "policy (its content) was" in other.stderr
 
 
-def digest(given):
-    return pickle_digest(cloudpickle.dumps(given))
+def digest(policy):
+    return pickle_digest(cloudpickle.dumps(policy))
 
 
 def shared(first, second):
@@ -75,7 +75,7 @@ def rings():
 
 
 class Lazy:
-    """Pickled with its `__dict__`, or as if it had none yet."""
+    """Pickled with a state, or without."""
 
     def __init__(self, *state):
         self.state = state
@@ -85,10 +85,10 @@ class Lazy:
 
 
 SAME = {
-    "objects whose __dict__ was read": (Lazy(), Lazy({})),
-    "strings that are one object, or two": (["ab", "ab"], ["ab", "".join("ab")]),
-    "sets that were filled in another order": ({8, 0}, {0, 8}),
-    "objects in a circle": (rings(), rings()),
+    "an empty __dict__, or none": (Lazy(), Lazy({})),
+    "one string object, or two": (["ab", "ab"], ["ab", "".join("ab")]),
+    "sets filled in another order": ({8, 0}, {0, 8}),
+    "reference cycles": (rings(), rings()),
 }
 DIFFERENT = {
     "weights": (np.zeros(3), np.array([0.0, 0.0, 1e-300])),
@@ -96,30 +96,28 @@ DIFFERENT = {
     "code": (lambda: 1 + len("x"), lambda: 2 + len("x")),
     "a set's elements": ({"a", "b"}, {"a", "c"}),
     "elements of nested sets": ({frozenset("ab")}, {frozenset("ac")}),
-    "where text ends": (["ab", "c"], ["a", "bc"]),
+    "bounds of strings": (["ab", "c"], ["a", "bc"]),
     "numbers and their texts": ([1], ["1"]),
     "the order of lists": ([1, 2], [2, 1]),
-    "lists that are one object, or two": (shared(*[[]] * 2), shared([], [])),
+    "one list object, or two": (shared(*[[]] * 2), shared([], [])),
     "arguments": (functools.partial(max, 1), functools.partial(max, 2)),
 }
 
 
 @pytest.mark.parametrize("kind", SAME)
 def test_equal_policies_have_equal_digests(kind):
-    """Although their pickles may differ."""
+    """Their pickles may differ."""
     one, other = SAME[kind]
     assert digest(one) == digest(other)
 
 
 @pytest.mark.parametrize("kind", DIFFERENT)
-def test_other_policies_have_other_digests(kind):
-    """Each of these changes what a policy does."""
+def test_different_policies_have_different_digests(kind):
     one, other = DIFFERENT[kind]
     assert digest(one) != digest(other)
 
 
 def test_deeply_nested_policies_have_a_digest():
-    """As deep as pickle itself can go."""
     chain = None
     for _ in range(300):
         chain = [chain]

@@ -14,25 +14,24 @@ import mjrec
 from mjrec.engines.jobs import Run, Work
 from mjrec.engines.ray import RayEngine
 
-# Ray's own connections and pipes, of which it says so when they are collected.
 pytestmark = [
     pytest.mark.ray_nodes,
+    # Ray leaves connections and pipes to the garbage collector.
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def home(tmp_path_factory):
-    """No process of Ray, and nothing in the home, is left by all tests of these."""
+    """Check that the tests leave no process of Ray and no file in the home."""
     with home_for_ray(tmp_path_factory.mktemp("home")):
         yield
 
 
 @pytest.fixture(scope="module")
 def cluster(home):
-    """A cluster of which one node has two GPUs, as Ray believes."""
+    """A cluster whose first worker node claims two GPUs. Its head runs no jobs."""
     small = {"object_store_memory": SMALL_STORE}
-    # Nothing runs on its head.
     head = {"num_cpus": 0, "include_dashboard": False, **small}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
@@ -49,8 +48,7 @@ def work(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["argument", "environment"])
-def test_a_cluster_that_there_is(how, cluster, work, monkeypatch):
-    """It is found, used with all that it has, and disconnected from."""
+def test_existing_cluster_is_used_and_left(how, cluster, work, monkeypatch):
     assert not ray.is_initialized()
     address = str(cluster.address)
     if how == "environment":
@@ -63,8 +61,8 @@ def test_a_cluster_that_there_is(how, cluster, work, monkeypatch):
     assert not ray.is_initialized()
 
 
-def test_workers_are_given_parts_of_gpus(cluster, work, caplog):
-    """That they draw in software all the same is said once, or is an error."""
+def test_workers_share_gpus(cluster, work, caplog):
+    """Rendering in software anyway is one warning, or an error."""
     engine = RayEngine(address=str(cluster.address), gpus=0.5)
     with Run(engine, work) as run:
         submit(run, *"abcd", do="where")
@@ -79,14 +77,13 @@ def test_workers_are_given_parts_of_gpus(cluster, work, caplog):
     engine.shutdown()
 
 
-def test_a_node_that_dies_takes_no_job_with_it(cluster, work, tmp_path, caplog):
-    """What it was at is begun elsewhere, and nothing else is done again."""
+def test_only_the_job_of_a_dead_node_is_retried(cluster, work, tmp_path, caplog):
     node = cluster.add_node(num_cpus=1, object_store_memory=SMALL_STORE)
     engine = RayEngine(address=str(cluster.address))
     with Run(engine, work) as run:
         for key in "abcd":
-            said = {"begun": str(tmp_path / key), "go": str(tmp_path / "go")}
-            submit(run, key, do="hold", **said)
+            files = {"begun": str(tmp_path / key), "go": str(tmp_path / "go")}
+            submit(run, key, do="hold", **files)
         for _ in run.results(timeout_s=0.05):
             if all(lines(tmp_path / key) for key in "abcd"):
                 break

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of the Ray engine, what `test_engines` does not try on every one."""
+"""The Ray engine; `test_engines` tests what holds on every engine."""
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -21,25 +22,22 @@ from waiting import wait_until
 
 from mjrec.engines.jobs import Run
 from mjrec.engines.ray import RayEngine
-from mjrec.errors import Error, InvalidArgument
+from mjrec.errors import Error, InvalidArgument, MissingDependency
 
-# Ray's own connections and pipes, of which it says so when they are collected.
+# Ray leaves connections and pipes to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def home(tmp_path_factory):
-    """No process of Ray, and nothing in the home, is left by all tests of these."""
+    """Check that the tests leave no process of Ray and no file in the home."""
     with home_for_ray(tmp_path_factory.mktemp("home")):
         yield
 
 
 @pytest.mark.thorough
-def test_a_killed_worker_of_ray_counts_as_a_death(tmp_path, caplog):
-    """Its child ends with it, and the job is begun again.
-
-    A driver that uses Ray for other things goes on doing so.
-    """
+def test_job_of_a_killed_ray_worker_is_retried(tmp_path, caplog):
+    """The worker's child ends. The driver's own use of Ray continues."""
     with own_ray(cpus=1) as ray:
         remembered = ray.put("of the caller")
         work = odd_work(shared=tmp_path / "shared", left=str(tmp_path / "left"))
@@ -58,8 +56,8 @@ def test_a_killed_worker_of_ray_counts_as_a_death(tmp_path, caplog):
 
 
 @pytest.mark.thorough
-def test_cancelling_does_not_wait_for_the_resources_of_others(tmp_path):
-    """Whose task holds the only CPU, and goes on; in the queue is nothing left."""
+def test_cancelling_does_not_wait_for_other_tasks(tmp_path):
+    """Another task holds the only CPU, and continues."""
     with own_ray(cpus=1) as ray:
         os.mkfifo(tmp_path / "pipe")
         other = ray.remote(num_cpus=1)(Path.read_text).remote(tmp_path / "pipe")
@@ -76,13 +74,12 @@ from pathlib import Path
 from engine_runs import odd_work, submit, values
 from mjrec.engines.jobs import Run
 from mjrec.engines.ray import RayEngine
-place = Path(sys.argv[1])
+directory = Path(sys.argv[1])
 """
 
 
 @pytest.mark.thorough
-def test_a_ray_of_our_own_leaves_nothing_behind(tmp_path):
-    """No process, no token, no variable, no handler of a signal; twice in a row."""
+def test_own_ray_leaves_no_process_variable_or_handler(tmp_path):
     script = f"""{BEGIN}
 def state():
     handlers = [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT)]
@@ -90,7 +87,7 @@ def state():
 before = state()
 for _ in range(2):
     engine = RayEngine(1)
-    with Run(engine, odd_work(shared=place)) as run:
+    with Run(engine, odd_work(shared=directory)) as run:
         submit(run, "a", do="echo")
         assert len(values(run)) == 1
         assert state() == before
@@ -105,14 +102,13 @@ print(sorted(os.listdir(os.environ["HOME"])))
 
 
 @pytest.mark.thorough
-def test_a_ray_of_our_own_without_a_gpu(tmp_path):
-    """One warning, and the jobs are done; nobody waits for what will never be there."""
+def test_own_ray_without_a_gpu_runs_jobs_with_one_warning(tmp_path):
     script = f"""{BEGIN}
 import logging
 from mjrec.errors import GLError
 logging.basicConfig(stream=sys.stdout, format="%(message)s")
 engine = RayEngine(1, gpus=0.5)
-with Run(engine, odd_work(shared=place)) as run:
+with Run(engine, odd_work(shared=directory)) as run:
     submit(run, "a", "b", do="echo")
     assert len(values(run)) == 2
 engine.shutdown()
@@ -121,10 +117,10 @@ try:
 except GLError as error:
     print("refused:", error)
 """
-    said = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
+    output = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
     warning = "Ray finds none on this machine. Workers render in software."
-    assert said.count(warning) == 1
-    assert "refused: GPUs were requested" in said
+    assert output.count(warning) == 1
+    assert "refused: GPUs were requested" in output
     wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
@@ -132,8 +128,7 @@ except GLError as error:
 @pytest.mark.parametrize(
     ("signum", "status"), [(signal.SIGTERM, 128 + 15), (signal.SIGKILL, -9)]
 )
-def test_a_driver_that_is_ended(tmp_path, signum, status):
-    """Says so by its exit status, and leaves no process."""
+def test_ended_driver_leaves_no_process(tmp_path, signum, status):
     with driver(tmp_path, "RayEngine(1)", **{MARK: str(tmp_path)}) as process:
         process.send_signal(signum)
     assert process.returncode == status
@@ -141,33 +136,22 @@ def test_a_driver_that_is_ended(tmp_path, signum, status):
     assert lines(tmp_path / "left") == lines(tmp_path / "begun")
 
 
-def test_ray_is_optional():
-    """It is heavy; without it there is an error that says what to install."""
-    script = """
-import sys
-import mjrec.engines.choice, mjrec.engines.ray
-assert "ray" not in sys.modules
-sys.modules["ray"] = None
-try:
-    mjrec.RayEngine()
-except ImportError as error:
-    print(type(error).__name__, error)
-"""
-    assert run_python("-c", script) == (
-        'MissingDependency engine="ray" needs ray, which is not installed. '
-        'Run: pip install "mjrec[ray]"\n'
-    )
+def test_error_without_ray_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    message = 'engine="ray" needs ray, which is not installed. Run: '
+    with pytest.raises(MissingDependency) as raised:
+        RayEngine()
+    assert str(raised.value) == f'{message}pip install "mjrec[ray]"'
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("address", "kind", "said"),
+    ("address", "kind", "message"),
     [
         ("127.0.0.1:1", Error, "No Ray cluster answers at 127.0.0.1:1"),
         ("ray://127.0.0.1:10001", InvalidArgument, "--address auto"),
     ],
 )
-def test_an_address_at_which_nothing_is(address, kind, said):
-    """The error says so soon, and what to look at."""
-    with pytest.raises(kind, match=said):
+def test_unreachable_or_unsupported_addresses_are_refused(address, kind, message):
+    with pytest.raises(kind, match=message):
         RayEngine(1, address=address).submit(len, "abc")

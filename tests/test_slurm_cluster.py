@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of the Slurm engine, what only Slurm can show."""
+"""The Slurm engine on a real Slurm cluster of one machine."""
 
 import contextlib
 import functools
@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import pytest
 from engine_runs import driver, lines, odd_work, submit, values, wait_for
@@ -21,7 +20,7 @@ from mjrec.errors import Error
 
 pytest.importorskip("submitit")
 
-# Slurm looks at its queue once in a while.
+# Slurm checks its queue every few seconds.
 until = functools.partial(wait_until, seconds=60)
 
 pytestmark = pytest.mark.slurm
@@ -34,13 +33,13 @@ SlurmctldHost={host}(127.0.0.1)
 SlurmUser=root
 SlurmdUser=root
 AuthType=auth/munge
-AuthInfo=socket={place}/munge.sock
-StateSaveLocation={place}/state
-SlurmdSpoolDir={place}/spool
-SlurmctldLogFile={place}/slurmctld.log
-SlurmdLogFile={place}/slurmd.log
-SlurmctldPidFile={place}/slurmctld.pid
-SlurmdPidFile={place}/slurmd.pid
+AuthInfo=socket={folder}/munge.sock
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
 SlurmctldPort={ports[0]}
 SlurmdPort={ports[1]}
 ProctrackType=proctrack/linuxproc
@@ -60,44 +59,41 @@ PartitionName=high Nodes={host} PriorityTier=2 PreemptMode=OFF
 
 @pytest.fixture(scope="module")
 def configuration(tmp_path_factory):
-    """The configuration file of a cluster that is up: of one machine, this one."""
-    place = tmp_path_factory.mktemp("slurm")
-    (place / "state").mkdir()
-    (place / "spool").mkdir()
-    key = place / "munge.key"
+    """Start a cluster on this machine, and return its configuration file."""
+    folder = tmp_path_factory.mktemp("slurm")
+    (folder / "state").mkdir()
+    (folder / "spool").mkdir()
+    key = folder / "munge.key"
     key.touch(0o400)
     key.write_bytes(secrets.token_bytes(1024))
-    configuration = place / "slurm.conf"
-    configuration.write_text(
-        CONFIGURATION.format(
-            host=socket.gethostname(), place=place, ports=_free_ports(2)
-        )
-    )
-    # By default slurmd looks for a mounted cgroup file system, which a change of root
-    # has none of, and ends where there is none.
-    (place / "cgroup.conf").write_text("CgroupPlugin=cgroup/v1\n")
+    configuration = folder / "slurm.conf"
+    values = {"host": socket.gethostname(), "folder": folder, "ports": _free_ports(2)}
+    configuration.write_text(CONFIGURATION.format(**values))
+    # By default slurmd needs a mounted cgroup file system, which a chroot lacks.
+    (folder / "cgroup.conf").write_text("CgroupPlugin=cgroup/v1\n")
     environ = {**os.environ, "SLURM_CONF": str(configuration)}
     daemons = [
         [
             *("munged", "--force", "--foreground", f"--key-file={key}"),
-            *(f"--socket={place}/munge.sock", f"--pid-file={place}/munge.pid"),
-            *(f"--seed-file={place}/munge.seed", f"--log-file={place}/munge.log"),
+            *(f"--socket={folder}/munge.sock", f"--pid-file={folder}/munge.pid"),
+            *(f"--seed-file={folder}/munge.seed", f"--log-file={folder}/munge.log"),
         ],
         ["slurmctld", "-D"],
         ["slurmd", "-D"],
     ]
     with contextlib.ExitStack() as stack:
         for command in daemons:
-            stack.enter_context(_running(command, environ, place))
-        _wait_until_up(environ)
+            stack.enter_context(_running(command, environ, folder))
+        sinfo = ("sinfo", "--noheader", "--format=%T")
+        until(lambda: _run(*sinfo, env=environ).stdout.split()[:1] == ["idle"])
         yield configuration
 
 
 @contextlib.contextmanager
-def _running(command, environ, place):
+def _running(command, environ, folder):
     with (
-        (place / f"{command[0]}.out").open("wb") as said,
-        subprocess.Popen(command, env=environ, stdout=said, stderr=said) as process,
+        (folder / f"{command[0]}.out").open("wb") as out,
+        subprocess.Popen(command, env=environ, stdout=out, stderr=out) as process,
     ):
         try:
             yield
@@ -109,20 +105,10 @@ def _running(command, environ, place):
                 process.kill()
 
 
-def _wait_until_up(environ):
-    deadline = time.monotonic() + 60
-    while True:
-        asked = subprocess.run(
-            ["sinfo", "--noheader", "--format=%T"],
-            env=environ,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if asked.stdout.split()[:1] == ["idle"]:
-            return
-        assert time.monotonic() < deadline, asked
-        time.sleep(0.1)
+def _run(*command, **options):
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, **options
+    )
 
 
 def _free_ports(count):
@@ -135,36 +121,33 @@ def _free_ports(count):
 
 @pytest.fixture(autouse=True)
 def cluster(configuration, monkeypatch):
-    """Nothing is left in its queue by any test."""
+    """Check that each test leaves the queue empty."""
     monkeypatch.setenv("SLURM_CONF", str(configuration))
     yield
-    until(lambda: not asked("squeue", "--noheader"))
+    until(lambda: not output("squeue", "--noheader"))
 
 
-def asked(*command):
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def output(*command):
+    done = _run(*command)
     assert not done.returncode, (command, done.stderr)
     return done.stdout.strip()
 
 
-def work(place):
-    return odd_work(shared=place / "shared", left=str(place / "left"))
+def work(folder):
+    return odd_work(shared=folder / "shared", left=str(folder / "left"))
 
 
-def hold(run, place):
-    submit(run, "held", do="hold", begun=str(place / "begun"))
+def hold(run, folder):
+    submit(run, "held", do="hold", begun=str(folder / "begun"))
 
 
 def slurm_job():
-    """Return the only one that runs."""
-    return asked("squeue", "--noheader", "--array", "--states=running", "--format=%i")
+    """Return the number of the only running job."""
+    return output("squeue", "--noheader", "--array", "--states=running", "--format=%i")
 
 
-def test_jobs_are_done_in_slurm_jobs(tmp_path):
-    """Which are submitted as one array, and have completed at the end.
-
-    So they do when they take a moment more than their work does.
-    """
+def test_slurm_jobs_are_one_array_and_complete(tmp_path):
+    """Even if a job takes a second longer than its work."""
     with Run(SlurmEngine(3, setup=["trap 'sleep 1' EXIT"]), work(tmp_path)) as run:
         for number in range(50):
             run.submit(str(number), do="where")
@@ -175,25 +158,24 @@ def test_jobs_are_done_in_slurm_jobs(tmp_path):
     assert not [outcome.failure for outcome in found if outcome.failure]
     [array] = {number.partition("_")[0] for number in submitted}
     assert submitted == {f"{array}_{n}" for n in range(12)}
-    states = asked("squeue", "--noheader", "--states=all", "-j", array, "--format=%T")
+    states = output("squeue", "--noheader", "--states=all", "-j", array, "--format=%T")
     assert set(states.split()) == {"COMPLETED"}
     assert not list((tmp_path / "shared").iterdir())
 
 
 @pytest.mark.parametrize("how", ["preempted", "cancelled", "killed"])
-def test_a_slurm_job_that_is_ended(tmp_path, how, caplog):
-    """Files are closed where there is time; what it was at is done in another."""
+def test_work_of_an_ended_slurm_job_is_done_in_another(tmp_path, how, caplog):
     with Run(SlurmEngine(1, partition="low"), work(tmp_path)) as run:
         hold(run, tmp_path)
         wait_for(tmp_path / "begun", run)
         first = slurm_job()
         (tmp_path / "begun").unlink()
         if how == "preempted":
-            # Needs the whole machine for a moment.
-            asked("srun", "--partition=high", "--cpus-per-task=4", "true")
+            # It needs all CPUs.
+            output("srun", "--partition=high", "--cpus-per-task=4", "true")
         else:
             options = ["--signal=KILL", "--full"] if how == "killed" else []
-            asked("scancel", *options, first)
+            output("scancel", *options, first)
         until(
             lambda: wait_for(tmp_path / "begun", run) and slurm_job() not in (first, "")
         )
@@ -201,19 +183,16 @@ def test_a_slurm_job_that_is_ended(tmp_path, how, caplog):
     assert lines(tmp_path / "left")
 
 
+# Takes two minutes: Slurm delays a requeued job.
 @pytest.mark.parametrize("how", ["requeued", "notice"])
-def test_a_slurm_job_that_is_put_back_into_the_queue(tmp_path, how):
-    """It does its work once more, under its number, in a new process.
-
-    Takes two minutes, for which Slurm holds such a job back.
-    """
+def test_requeued_slurm_job_repeats_its_work_in_a_new_process(tmp_path, how):
     go = tmp_path / "go"
     with Run(SlurmEngine(1), work(tmp_path)) as run:
         submit(run, "a", do="hold", begun=str(tmp_path / "begun"), go=str(go))
         first = wait_for(tmp_path / "begun", run)
         number = slurm_job()
         options = ("scancel", "--signal=USR2", "--full")
-        asked(*(options if how == "notice" else ("scontrol", "requeue")), number)
+        output(*(options if how == "notice" else ("scontrol", "requeue")), number)
         wait_until(lambda: len(lines(tmp_path / "begun")) == 2, seconds=200)
         assert slurm_job() == number
         go.touch()
@@ -222,31 +201,28 @@ def test_a_slurm_job_that_is_put_back_into_the_queue(tmp_path, how):
     assert lines(tmp_path / "left")[0] == str(first)
 
 
-def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(tmp_path, monkeypatch):
-    """Where the cluster is is."""
+def test_only_slurm_conf_is_passed_on_from_the_drivers_slurm_job(tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_JOB_ID", "9999")
     monkeypatch.setenv("SLURM_MEM_PER_GPU", "1")
-    made = SlurmEngine(1, setup=[f"env > {tmp_path / 'environ'}"])
-    with Run(made, work(tmp_path)) as run:
+    engine = SlurmEngine(1, setup=[f"env > {tmp_path / 'environ'}"])
+    with Run(engine, work(tmp_path)) as run:
         run.submit("a", do="echo")
         assert next(run.results()) is not None
-    given = dict(line.partition("=")[::2] for line in lines(tmp_path / "environ"))
-    assert given["SLURM_CONF"] == os.environ["SLURM_CONF"]
-    assert given["SLURM_JOB_ID"] != "9999"
-    assert "SLURM_MEM_PER_GPU" not in given
+    environ = dict(line.partition("=")[::2] for line in lines(tmp_path / "environ"))
+    assert environ["SLURM_CONF"] == os.environ["SLURM_CONF"]
+    assert environ["SLURM_JOB_ID"] != "9999"
+    assert "SLURM_MEM_PER_GPU" not in environ
     assert os.environ["SLURM_MEM_PER_GPU"] == "1"
 
 
-def test_what_slurm_refuses(tmp_path):
-    """The error has its words."""
+def test_refused_submission_shows_slurms_message(tmp_path):
     with Run(SlurmEngine(1, partition="none"), work(tmp_path)) as run:
         hold(run, tmp_path)
         with pytest.raises(Error, match=r"No job could be submitted: .*partition"):
             next(run.results())
 
 
-def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
-    """Those that wait in the queue too."""
+def test_next_driver_ends_running_and_queued_jobs_of_a_killed_one(tmp_path):
     with driver(tmp_path, "SlurmEngine(2)") as process:
         process.kill()
     [pid] = lines(tmp_path / "begun")
@@ -257,18 +233,17 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     assert not (tmp_path / "shared" / WORK_FOLDER).exists()
 
 
-def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path):
-    """Byte for byte that of one process."""
+def test_evaluation_from_a_slurm_job_equals_that_of_one_process(tmp_path):
     command = [
         *(sys.executable, "-m", "mjrec", "evaluate", "InvertedPendulum-v5"),
         *("--policy", "random", "--keep", "none"),
         *("--episodes", "2", "--num-seeds", "2", "--max-steps", "5"),
     ]
-    asked(*command, "--out", str(tmp_path / "here"))
+    output(*command, "--out", str(tmp_path / "here"))
     small_job = ("srun", "--cpus-per-task=1", "--mem-per-cpu=10")
     there = str(tmp_path / "there")
     engine_options = ("--engine", "slurm", "--engine-option", "mem_gb=0.5")
-    asked(*small_job, *command, "--out", there, *engine_options)
+    output(*small_job, *command, "--out", there, *engine_options)
     for name in ("results.csv", "results.json"):
-        one, other = (tmp_path / place / name for place in ("here", "there"))
+        one, other = (tmp_path / side / name for side in ("here", "there"))
         assert one.read_bytes() == other.read_bytes()

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of the Slurm engine, what needs no Slurm and `test_engines` does not try.
+"""The Slurm engine without Slurm: submitit starts local processes as Slurm jobs.
 
-submitit starts processes of this machine in place of Slurm jobs; `test_slurm_cluster`
-tries a real cluster.
+`test_engines` tests what holds on every engine, `test_slurm_cluster` a real cluster.
 """
 
 import os
@@ -38,11 +37,11 @@ pytest.importorskip("submitit")
 
 @pytest.fixture(autouse=True)
 def mark(monkeypatch):
-    """Every process that a test has started, or they have, is gone at its end."""
+    """Check that no descendant process is left at the end of a test."""
     mark = secrets.token_hex(8)
     monkeypatch.setenv(MARK, mark)
     yield mark
-    # submitit waits for a minute for what it is to run, also where that is removed.
+    # submitit waits for a minute for its pickled function, even if that is deleted.
     wait_until(lambda: not marked(mark), seconds=90, told=lambda: marked(mark))
 
 
@@ -50,8 +49,8 @@ def engine(workers=1, **options):
     return SlurmEngine(workers, cluster="local", **options)
 
 
-def begun(place, workers=1, **settings):
-    return Run(engine(workers), odd_work(shared=place / "shared", **settings))
+def begin(place, **settings):
+    return Run(engine(), odd_work(shared=place / "shared", **settings))
 
 
 def submitted(place):
@@ -61,22 +60,18 @@ def submitted(place):
 
 
 @pytest.mark.thorough
-def test_a_slurm_job_may_hold_several_workers(tmp_path):
-    """Who wait for each other in one, and share what GPUs it was given."""
+def test_workers_of_one_slurm_job_run_in_parallel(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    made = engine(2, workers_per_job=2)
-    with Run(made, odd_work(shared=tmp_path / "shared")) as run:
-        for number, mode in enumerate(("rb", "wb")):
-            # All workers of a Slurm job do what is that job's.
-            pipe = str(tmp_path / "pipe")
-            submit(run, f"{number}", do="meet", pipe=pipe, mode=mode)
+    slurm = engine(2, workers_per_job=2)
+    with Run(slurm, odd_work(shared=tmp_path / "shared")) as run:
+        for mode in ("rb", "wb"):
+            submit(run, mode, do="meet", pipe=str(tmp_path / "pipe"), mode=mode)
         assert len({value["pid"] for value in values(run)}) == 2
-    made.shutdown()
+    slurm.shutdown()
 
 
-def test_jobs_given_at_once_are_one_array(tmp_path):
-    """Of no more Slurm jobs than four for each worker, however many jobs."""
-    with begun(tmp_path) as run:
+def test_an_array_has_at_most_four_slurm_jobs_per_worker(tmp_path):
+    with begin(tmp_path) as run:
         submit(run, *map(str, range(30)), do="echo")
         assert len(values(run)) == 30
         assert len(submitted(tmp_path)) == 4
@@ -84,12 +79,9 @@ def test_jobs_given_at_once_are_one_array(tmp_path):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL, signal.SIGUSR2])
-def test_a_slurm_job_that_is_ended(signum, tmp_path):
-    """What it was at is done in another, or in itself, back in the queue.
-
-    By SIGUSR2, as before its time limit, it is put there.
-    """
-    with begun(tmp_path, left=str(tmp_path / "left")) as run:
+def test_work_of_an_ended_slurm_job_is_done_in_a_new_process(signum, tmp_path):
+    """SIGUSR2, sent before the time limit, requeues the same Slurm job."""
+    with begin(tmp_path, left=str(tmp_path / "left")) as run:
         submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
         first = wait_for(tmp_path / "begun", run)
         (tmp_path / "begun").unlink()
@@ -100,17 +92,15 @@ def test_a_slurm_job_that_is_ended(signum, tmp_path):
         wait_until(lambda: str(first) in lines(tmp_path / "left"))
 
 
-def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path):
-    """Three rounds are enough."""
-    made = engine(setup=["echo no such module >&2; exit 1"])
-    with Run(made, odd_work(shared=tmp_path / "shared")) as run:
+def test_failing_setup_is_an_error(tmp_path):
+    slurm = engine(setup=["echo no such module >&2; exit 1"])
+    with Run(slurm, odd_work(shared=tmp_path / "shared")) as run:
         submit(run, "a", do="echo")
         with pytest.raises(Error, match=r"No worker can start.* was in the Slurm job"):
             outcomes(run)
 
 
-def test_slurm_jobs_that_are_not_started(tmp_path, monkeypatch, caplog):
-    """Their number is told, and Slurm's reason."""
+def test_warning_names_the_reason_of_waiting_slurm_jobs(tmp_path, monkeypatch, caplog):
     cancelled = tmp_path / "cancelled"
     for name, does in {
         "sbatch": "echo Submitted batch job 7",
@@ -129,8 +119,7 @@ def test_slurm_jobs_that_are_not_started(tmp_path, monkeypatch, caplog):
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_in_a_terminal(tmp_path):
-    """It reaches all processes there; the driver ends those that are Slurm's."""
+def test_ctrl_c_ends_slurm_jobs(tmp_path):
     with driver(tmp_path, 'SlurmEngine(2, cluster="local")') as process:
         os.killpg(process.pid, signal.SIGINT)
         process.wait(60)
@@ -139,16 +128,15 @@ def test_ctrl_c_in_a_terminal(tmp_path):
 
 
 @pytest.mark.thorough
-def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
-    """Whose Slurm jobs have gone on until then; a living one's do."""
+def test_next_driver_ends_slurm_jobs_of_killed_drivers_only(tmp_path):
     with driver(tmp_path, 'SlurmEngine(2, cluster="local")') as process:
         process.kill()
     [pid] = lines(tmp_path / "begun")
-    with begun(tmp_path) as living:
+    with begin(tmp_path) as living:
         submit(living, "a", do="echo")
         assert len(values(living)) == 1
         wait_for_end(int(pid))
-        with begun(tmp_path) as run:
+        with begin(tmp_path) as run:
             submit(run, "b", do="echo")
             assert len(values(run)) == 1
         submit(living, "c", do="echo")
@@ -157,7 +145,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"workers": 0}, "workers must be"),
         ({"cluster": "pbs"}, "cluster must be"),
@@ -169,20 +157,20 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
         ({"gpus": -1}, "gpus must be the number"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_starts(options, said):
-    """By default there are four workers, or on this machine one for each CPU."""
-    with pytest.raises(InvalidArgument, match=said):
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(InvalidArgument, match=message):
         SlurmEngine(**{"cluster": "local", **options})
+
+
+def test_local_cluster_has_a_worker_per_cpu_and_takes_no_functions():
     assert engine(None).workers == usable_cpus()
     assert DEFAULT_WORKERS == 4
     assert repr(engine(3)) == "SlurmEngine(workers=3, cluster='local')"
-    # Outcomes of jobs are files, which other functions would not write.
     with pytest.raises(InvalidArgument, match="submitit executor"):
         engine().submit(len, "abc")
 
 
-def test_what_is_missing_is_named(tmp_path, monkeypatch):
-    """Slurm's programs, or submitit, and what to do."""
+def test_missing_slurm_or_submitit_is_an_error(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setenv("PATH", str(tmp_path))
         with pytest.raises(Error, match=r"no sbatch, squeue, .* login node"):
@@ -192,11 +180,7 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
         engine()
 
 
-def test_options_as_texts():
-    """Of the command line; those of a GPU may be in the cluster's own words.
-
-    A slip is told with what there is.
-    """
+def test_options_of_the_command_line_reach_sbatch():
     texts = {
         "partition": "gpu",
         "time_min": "30",
@@ -228,25 +212,22 @@ def test_options_as_texts():
 
 
 def sbatch_script(texts, **options):
-    """Return what submitit would give to `sbatch`, for an array of three."""
+    """Return submitit's batch script for an array of three."""
     import submitit
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
-        made = SlurmEngine(**options, **slurm_options(texts))
+        slurm = SlurmEngine(**options, **slurm_options(texts))
         executor = submitit.AutoExecutor("logs", cluster="slurm")
-    executor.update_parameters(**made._parameters)
-    slurm = executor._executor
-    slurm.parameters["map_count"] = 3
-    return str(slurm._make_submission_file_text("command", "uid"))
+    executor.update_parameters(**slurm._parameters)
+    executor._executor.parameters["map_count"] = 3
+    return str(executor._executor._make_submission_file_text("command", "uid"))
 
 
-def test_import_is_inert():
-    """An engine needs submitit, which is to leave logging as it is."""
+def test_submitit_leaves_logging_unchanged():
     script = """
-import logging, os, sys
+import logging, os
 import mjrec.engines.slurm
-assert "submitit" not in sys.modules
 handler = logging.StreamHandler()
 mjrec.engines.slurm.SlurmEngine(1, cluster="local")
 assert not logging.getLogger("submitit").handlers

@@ -23,7 +23,7 @@ TENTHS = np.linspace(0, 1, 11)
 USUAL = Bootstrap()
 QUICK = Bootstrap(resamples=500)
 
-# Ten runs of six tasks; the figures below are what rliable 1.2.0 says of them.
+# Ten runs of six tasks; the expected figures below are rliable 1.2.0's.
 X = [
     np.array([0.43, 0.65, 0.13, 0.56, 0.11, 0.05, 0.35, 0.49, 0.39, 0.22]),
     np.array([0.29, 0.55, 0.41, 0.67, 0.79, 0.42, 0.32, 0.22, 0.51, 0.42]),
@@ -54,8 +54,7 @@ def ends(interval):
     return [interval.low, interval.high]
 
 
-def test_figures_across_tasks_are_rliables():
-    """To the last digit but rounding."""
+def test_figures_across_tasks_equal_rliables():
     assert interquartile_mean(X).value == pytest.approx(0.37966666666666665)
     assert optimality_gap(X).value == pytest.approx(0.6111666666666666)
     better = average(improvement(x, y) for x, y in zip(X, Y, strict=True))
@@ -64,8 +63,8 @@ def test_figures_across_tasks_are_rliables():
     assert performance_profile(X, TENTHS).values == pytest.approx([*profile, 0, 0])
 
 
-def test_intervals_across_tasks_are_rliables():
-    """Those of its stratified bootstrap of 20000 (profile: 5000), to their noise."""
+def test_intervals_across_tasks_equal_rliables():
+    """Tolerances cover the noise of its 20,000 (profile: 5,000) resamples."""
     found = ends(interquartile_mean(X).interval(USUAL))
     assert found == pytest.approx([0.3243, 0.4340], abs=0.004)
     found = ends(optimality_gap(X).interval(USUAL))
@@ -79,10 +78,10 @@ def test_intervals_across_tasks_are_rliables():
     assert band[1] == pytest.approx(high, abs=0.018)
 
 
-def test_tasks_count_alike_however_many_episodes_they_have():
-    """Gap and profile are means over tasks; the interquartile mean is of episodes.
+def test_gap_and_profile_weight_tasks_alike():
+    """The interquartile mean weights episodes alike.
 
-    A score at a threshold is not above it, and more than 1 makes up for nothing.
+    A score at a threshold is not above it, and one above 1 does not lower the gap.
     """
     scores = [array(1.0, 1.0), np.zeros(98)]
     assert optimality_gap(scores).value == 0.5
@@ -98,8 +97,7 @@ def test_tasks_count_alike_however_many_episodes_they_have():
     # Newcombe (1998), table I, method 3.
     [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (1, 29, 0.0061, 0.1718)],
 )
-def test_wilson_interval_as_published(successes, n, low, high):
-    """To the digits that were printed; it ends where all or none succeeded."""
+def test_wilson_interval_equals_published_digits(successes, n, low, high):
     found = ends(wilson_interval(successes, n, 0.95))
     assert [round(end, 4) for end in found] == [low, high]
     assert wilson_interval(n, n, 0.95).high == 1
@@ -123,8 +121,7 @@ FIGURES = {
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_both_kinds_of_intervals_agree(name, monkeypatch):
-    """That of large samples is the bootstrap's, to a tenth of its width."""
+def test_large_sample_interval_is_close_to_the_bootstraps(name, monkeypatch):
     figure = FIGURES[name](normal(60), normal(90, 550, seed=1))
     low, high = ends(figure.interval(USUAL))
     assert figure.interval_method == PERCENTILE_BOOTSTRAP
@@ -135,8 +132,7 @@ def test_both_kinds_of_intervals_agree(name, monkeypatch):
     )
 
 
-def test_large_sample_band_of_a_profile(monkeypatch):
-    """That of the bootstrap, to a tenth of its width."""
+def test_large_sample_band_is_close_to_the_bootstraps(monkeypatch):
     profile = performance_profile([normal(200) / 1000, normal(300) / 1000], array(0.5))
     resampled = np.array(profile.ends(USUAL))
     monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
@@ -144,8 +140,7 @@ def test_large_sample_band_of_a_profile(monkeypatch):
     assert np.array(profile.ends(USUAL)) == pytest.approx(resampled, abs=0.1 * width)
 
 
-def test_same_seed_same_interval():
-    """Whatever the order; and another seed another."""
+def test_interval_depends_on_the_seed_but_not_on_order():
     values = np.arange(10.0)
     first = interquartile_mean([values]).interval(QUICK)
     assert interquartile_mean([values[::-1]]).interval(QUICK) == first
@@ -153,14 +148,12 @@ def test_same_seed_same_interval():
     assert interquartile_mean([values]).interval(other) != first
 
 
-def test_a_single_value_has_no_interval():
-    """One of no width would say that all is known."""
+def test_single_values_have_no_interval():
     for figure in (mean(array(1)), improvement(array(1, 2), array(3))):
         assert (figure.interval(QUICK), figure.interval_method) == (None, None)
 
 
 @pytest.mark.parametrize("wrong", [{"resamples": 10**7}, {"confidence": 1.0}])
 def test_impossible_bootstraps_are_refused(wrong):
-    """Before anything is read or run."""
     with pytest.raises(InvalidArgument, match="but it is"):
         Bootstrap(**wrong)

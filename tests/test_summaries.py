@@ -39,8 +39,7 @@ def result(seed, episode, total, **more):
     )
 
 
-def test_figures_of_a_task_by_hand():
-    """Two seeds, five episodes, one of which failed."""
+def test_figures_of_a_task():
     summary = summarize_results(
         TASK,
         [
@@ -59,7 +58,7 @@ def test_figures_of_a_task_by_hand():
     assert (summary.minimum, summary.maximum) == (2, 10)
     assert summary.mean_length == 15
     assert (summary.terminated, summary.truncated) == (2, 2)
-    # The environment said so of three; the failed one was none.
+    # A failed episode is no success.
     assert (summary.success_known, summary.success_rate) == (4, 0.5)
     assert summary.success_interval == wilson_interval(2, 4, 0.95)
     assert dict(summary.warnings) == {"BADQACC": 3, "BADQPOS": 1}
@@ -68,8 +67,7 @@ def test_figures_of_a_task_by_hand():
     assert 2 <= summary.mean_interval.low < 5 < summary.mean_interval.high <= 10
 
 
-def test_nothing_is_said_of_nothing():
-    """No episode, no figures; of one, no spread; and no NaN."""
+def test_figures_of_none_or_one_episode():
     nothing = summarize_task(TASK, total_rewards=[], runs=0)
     assert nothing == TaskSummary(task=TASK, runs=0, episodes=0)
     failed = summarize_results(TASK, [result(0, 0, None)] * 2)
@@ -81,8 +79,7 @@ def test_nothing_is_said_of_nothing():
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_returns_that_are_no_numbers_leave_no_figures(wrong):
-    """Without them the mean would say too much; how many there are is said."""
+def test_nan_and_infinite_returns_are_counted_and_leave_no_figures(wrong):
     summary = summarize_task(
         TASK, total_rewards=[1, 2, wrong], runs=1, lengths=[5, 5, 5]
     )
@@ -91,13 +88,12 @@ def test_returns_that_are_no_numbers_leave_no_figures(wrong):
     assert (summary.mean_interval, summary.mean_length) == (None, 5)
     across = summarize_across({TASK: [1, wrong]}, {TASK: (0, 1000)})
     assert across.left_out == {TASK: "1 of 2 returns are NaN or infinite"}
-    # What cannot be added up has no mean, either.
+    # A sum that overflows leaves no mean.
     huge = summarize_task(TASK, total_rewards=[1e308] * 4, runs=1)
     assert (huge.mean, huge.mean_interval, huge.maximum) == (None, None, 1e308)
 
 
-def test_many_episodes_are_summarized_at_once():
-    """A million in little more memory than they have; the method is named."""
+def test_a_million_episodes_take_little_more_memory():
     returns = np.random.default_rng(0).normal(500, 100, 1_000_000)
     tracemalloc.start()
     summary = summarize_task(TASK, total_rewards=returns, runs=1)
@@ -110,8 +106,7 @@ def test_many_episodes_are_summarized_at_once():
     )
 
 
-def test_default_score_range():
-    """The suite has one, but where rewards have no bound."""
+def test_bounded_tasks_of_the_suite_have_a_default_score_range():
     assert default_score_range(TASK, None) == (0, 1000)
     assert default_score_range(TASK, 250) == (0, 250)
     assert default_score_range("dm_control/lqr-lqr_2_1", None) is None
@@ -120,14 +115,14 @@ def test_default_score_range():
 
 @pytest.mark.dm_control
 def test_the_suites_episodes_have_a_thousand_steps():
-    """What the default range relies on."""
+    """The default range relies on it."""
     suite = pytest.importorskip("dm_control.suite")
     for domain, task in dict(suite.BENCHMARKING).items():
         assert suite.load(domain, task)._step_limit == 1000, domain
 
 
-def test_figures_across_tasks_by_hand():
-    """Three tasks of two episodes; the others are left out, with the reason."""
+def test_figures_across_tasks():
+    """Tasks without scores are left out, with the reason."""
     returns = {"a": [-10, 6], "b": [5, 5], "c": [0.5, 1.0], "y": []}
     scales = {"a": (-10, 10), "b": (0, 10), "c": (0, 1), "y": (0, 1)}
     without = {"x": [1], "dm_control/lqr-x": [1]}
@@ -140,7 +135,7 @@ def test_figures_across_tasks_by_hand():
         "y": "no episode was completed",
     }
     assert (across.mean, across.median) == (pytest.approx(0.55), pytest.approx(0.5))
-    # One is cut off at each end.
+    # Without the lowest and the highest score.
     assert across.iqm == pytest.approx(2.3 / 4)
     assert across.optimality_gap == pytest.approx(0.45)
     profile = across.profile
@@ -150,8 +145,7 @@ def test_figures_across_tasks_by_hand():
         assert low - 1e-12 <= share <= high + 1e-12
 
 
-def test_what_cannot_be_said_across_tasks():
-    """A task of one episode leaves no intervals; none with a scale, no figures."""
+def test_a_task_of_one_episode_leaves_no_intervals():
     scales = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
     across = summarize_across({"a": [0.5], "b": [0.1, 0.9]}, scales, bootstrap=QUICK)
     assert across.iqm is not None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A verification on one screen: the verdict, excuses with costs, a line a topic."""
+"""A verification on one screen: verdict, excuses with costs, a line for each topic."""
 
 import dataclasses
 import io
@@ -13,10 +13,10 @@ from mjrec.evidence import summary
 from mjrec.evidence.findings import Outcome, Topic
 
 
-def screen(made, **options):
+def screen(result, **options):
     stream = io.StringIO()
     console = rich.console.Console(file=stream, width=120)
-    show_verification(made, console, **options)
+    show_verification(result, console, **options)
     return stream.getvalue()
 
 
@@ -31,7 +31,7 @@ GL_FRAMES = finding(
 
 
 @pytest.mark.parametrize(
-    ("made", "words"),
+    ("result", "words"),
     [
         (verification(finding()), "PASS  run.zip: everything was recreated"),
         (
@@ -46,24 +46,22 @@ GL_FRAMES = finding(
         (verification(), "FAIL  run.zip: nothing could be recreated"),
     ],
 )
-def test_the_verdict_comes_first(made, words):
-    """In words, on the first line; gaps stand beside it."""
-    assert words in screen(made).splitlines()[0]
+def test_verdict_and_gaps_are_the_first_lines(result, words):
+    assert words in screen(result).splitlines()[0]
     gap = finding(Outcome.BELIEVED, reason="episode 3 is missing", is_headline=True)
-    with_gap = dataclasses.replace(made, findings=(*made.findings, gap))
+    with_gap = dataclasses.replace(result, findings=(*result.findings, gap))
     assert "episode 3 is missing" in screen(with_gap).splitlines()[1]
 
 
-def test_an_excuse_says_what_it_costs():
-    """The claim, the reader's own, and how much was believed for it."""
-    made = verification(finding(), GL_FRAMES, excuses=(excuse(items=tuple("abcde")),))
-    assert summary.excuses(made) == [
+def test_excuses_state_claim_and_cost():
+    result = verification(finding(), GL_FRAMES, excuses=(excuse(items=tuple("abcde")),))
+    assert summary.excuses(result) == [
         "gl NVIDIA H100 (here llvmpipe) of a, b, c and 2 more: frames are alike; "
         "500 frames within tolerance, the worst 33.1 dB"
     ]
     refuted = verification(excuses=(excuse(refuted=True),))
     assert "refuted" in summary.excuses(refuted)[0]
-    # What nothing needs costs nothing, and shares a line.
+    # Excuses without cost share a line.
     idle = {"claimed": "1", "here": "2", "is_needed": False}
     excuses = tuple(excuse(name=name, **idle) for name in ("python", "zlib"))
     assert summary.excuses(verification(excuses=excuses)) == [
@@ -71,8 +69,7 @@ def test_an_excuse_says_what_it_costs():
     ]
 
 
-def test_each_topic_has_a_line_with_counts():
-    """The worst outcome, and how much of what."""
+def test_each_topic_has_a_line_with_its_worst_outcome_and_counts():
     rewards = {"topic": Topic.REWARDS, "unit": "episode"}
     why, fast = "their actions were not kept", "plays at 2 times real time"
     shown = verification(
@@ -91,8 +88,7 @@ def test_each_topic_has_a_line_with_counts():
     assert lines[Topic.VIDEOS] == ("not looked at", f"{fast} (2 videos)")
 
 
-def test_one_screen_is_enough_and_verbose_has_the_rest():
-    """However many places differ."""
+def test_many_differences_fit_one_screen_and_verbose_has_all():
     many = verification(
         *(finding(Outcome.DIFFERENT, reason=f"place {n}") for n in range(100)),
         facts={"mujoco": "3.17.0"},
@@ -106,8 +102,7 @@ def test_one_screen_is_enough_and_verbose_has_the_rest():
     assert "mujoco: 3.17.0" in long
 
 
-def test_hostile_text_gives_a_terminal_no_orders():
-    """What cannot be printed is spelled out, and marks of ours are text."""
+def test_control_characters_and_markup_are_escaped():
     shown = screen(
         verification(
             finding(Outcome.DIFFERENT, item=HOSTILE, reason="\x1b[2J[bold]"),

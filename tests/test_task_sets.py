@@ -8,11 +8,8 @@ from mjrec import EnvironmentNotMade, InvalidArgument, MissingDependency, Unknow
 from mjrec.evaluation.task_sets import TASK_SETS, tasks_from
 
 
-def test_gymnasium_mujoco_is_the_newest_version_of_each():
-    """Eleven environments, all v5 as of Gymnasium 1; a name that is given twice is one.
-
-    Without a version the newest is meant.
-    """
+def test_sets_and_names_without_version_give_the_newest():
+    """Duplicates are dropped."""
     tasks = tasks_from(["gymnasium:mujoco"])
     assert len(tasks) == 11
     assert "HalfCheetah-v5" in tasks
@@ -21,12 +18,13 @@ def test_gymnasium_mujoco_is_the_newest_version_of_each():
     names = ["Hopper-v5", "dm_control/walker-walk", "Hopper", "Ant-v5", "Hopper-v5"]
     assert tasks_from(names) == ("Hopper-v5", "dm_control/walker-walk", "Ant-v5")
     assert tasks_from("No_such") == ("No_such",)
+    assert tasks_from(["gymnasium:Ant-v5"]) == ("gymnasium:Ant-v5",)
 
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_sets_of_the_suite_are_the_suites_own():
-    """Sorted, so that no version of dm_control gives them in another order."""
+def test_sets_of_the_suite_are_sorted():
+    """Versions of dm_control have them in different orders."""
     from dm_control import suite
 
     for tag in ("benchmarking", "easy", "hard", "extra"):
@@ -37,8 +35,7 @@ def test_sets_of_the_suite_are_the_suites_own():
 
 
 @pytest.mark.dm_control
-def test_patterns_are_matched_against_both_frameworks():
-    """With `*`, `?` and brackets."""
+def test_patterns_match_both_frameworks():
     assert tasks_from(["dm_control/walker-*", "HalfCheetah-v[45]"]) == (
         *("dm_control/walker-run", "dm_control/walker-stand"),
         *("dm_control/walker-walk", "HalfCheetah-v4", "HalfCheetah-v5"),
@@ -47,8 +44,8 @@ def test_patterns_are_matched_against_both_frameworks():
     assert "dm_control/acrobot-swingup" in tasks_from(["*swingup"])
 
 
-def test_a_pattern_may_name_a_module_that_registers(tmp_path, monkeypatch):
-    """It may lie in the working directory, and is not imported here."""
+def test_patterns_can_name_a_registering_module(tmp_path, monkeypatch):
+    """A module of the working directory is imported in another process."""
     (tmp_path / "their_environments.py").write_text(
         "import gymnasium\n"
         "gymnasium.register('Theirs-v0', 'gymnasium.envs.mujoco:HopperEnv')\n"
@@ -72,19 +69,20 @@ def test_a_pattern_may_name_a_module_that_registers(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["dm_control:bench", "gymnasium:atari", "Halv*"])
-def test_an_unknown_set_lists_the_sets(text):
-    """Also one of Gymnasium's, whose own module could be meant by a colon."""
+def test_unknown_set_lists_the_sets(text):
     with pytest.raises(UnknownName) as caught:
         tasks_from([text])
     assert all(name in str(caught.value) for name in TASK_SETS)
-    assert tasks_from(["gymnasium:Ant-v5"]) == ("gymnasium:Ant-v5",)
-    for texts in ([], [""], ["dm_control/walker"]):
-        with pytest.raises(InvalidArgument):
-            tasks_from(texts)
 
 
-def test_a_set_without_its_framework_says_what_to_install(tmp_path, monkeypatch):
-    """The line for pip, and a pattern that may mean others goes without it."""
+@pytest.mark.parametrize("texts", [[], [""], ["dm_control/walker"]])
+def test_empty_and_incomplete_names_are_refused(texts):
+    with pytest.raises(InvalidArgument):
+        tasks_from(texts)
+
+
+def test_missing_framework_says_what_to_install(tmp_path, monkeypatch):
+    """Patterns that match other environments work without it."""
     (tmp_path / "dm_control.py").write_text(
         "raise ModuleNotFoundError('No dm_control', name='dm_control')\n"
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a verification: what it says, and that nothing can be slipped into it."""
+"""The page of a verification, also with hostile text."""
 
 import html.parser
 import re
@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browsers import barriers_of, chromium
 from verifications import HOSTILE, excuse, finding, verification
 
 from mjrec import MissingDependency
@@ -15,7 +16,7 @@ from mjrec.evidence.verification_report import write_verification_report
 
 
 class Page(html.parser.HTMLParser):
-    """What a page about findings is made of."""
+    """Writes and parses a page about findings."""
 
     def __init__(self, tmp_path, *findings, **changes):
         super().__init__()
@@ -41,8 +42,8 @@ class Page(html.parser.HTMLParser):
             self.words.append(" ".join(data.split()))
 
 
-def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
-    """With excuses, inputs, a line for each topic, and all findings."""
+def test_the_verdict_comes_first_and_then_differences(tmp_path):
+    """Excuses, inputs, and lines for topics and findings follow."""
     page = Page(
         tmp_path,
         finding(reason="seven steps"),
@@ -67,8 +68,7 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
     assert all(str(topic) in page.shown for topic in Topic)
 
 
-def test_it_says_how_to_make_it_again(tmp_path):
-    """With the options that it was made with."""
+def test_the_command_has_the_options_of_the_verification(tmp_path):
     facts = {"sample": 20, "seed": 7, "trust": ["A b-v0"], "allow": ["gl=H100"]}
     shown = Page(tmp_path, facts=facts).shown
     assert (
@@ -79,11 +79,10 @@ def test_it_says_how_to_make_it_again(tmp_path):
     assert "It runs no code that the archive names" in Page(tmp_path).shown
 
 
-def test_the_page_is_whole_and_loads_nothing_whatever_is_in_it(tmp_path):
-    """Its elements close, no attribute leads anywhere, and hostile text stays text."""
+def test_hostile_text_stays_text_and_the_page_loads_nothing(tmp_path):
     inputs = {"a": {"b": "c"}}
-    given = {"excuses": (excuse(),), "inputs": inputs, "facts": inputs}
-    clean = Page(tmp_path, *map(finding, Outcome), **given)
+    rest = {"excuses": (excuse(),), "inputs": inputs, "facts": inputs}
+    clean = Page(tmp_path, *map(finding, Outcome), **rest)
     hostile = Page(
         tmp_path,
         *(finding(each, item=HOSTILE, reason=HOSTILE) for each in Outcome),
@@ -107,8 +106,8 @@ def test_the_page_is_whole_and_loads_nothing_whatever_is_in_it(tmp_path):
     assert "{{7*7}}" in hostile.text
 
 
-def test_many_findings_make_no_endless_page(tmp_path):
-    """What is left out is counted."""
+def test_size_of_the_page_is_limited(tmp_path):
+    """Omitted findings are counted."""
     many = [finding(Outcome.DIFFERENT, reason=f"{n} {'x' * 5000}") for n in range(1500)]
     page = Page(tmp_path, *many)
     assert len(page.text) < 2_000_000
@@ -116,8 +115,7 @@ def test_many_findings_make_no_endless_page(tmp_path):
     assert "1300 more are not listed" in page.shown
 
 
-def test_without_jinja_it_is_said_what_to_install(tmp_path, monkeypatch):
-    """Verifying without a report needs none."""
+def test_error_without_jinja_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(MissingDependency, match=r"pip install 'mjrec\[evidence\]'"):
         Page(tmp_path)
@@ -127,14 +125,8 @@ def test_without_jinja_it_is_said_what_to_install(tmp_path, monkeypatch):
 @pytest.mark.axe
 @pytest.mark.browser
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_keeps_nobody_out(tmp_path, scheme):
-    """axe-core finds nothing serious, and a phone scrolls in one direction only."""
-    # Here: most tests of this file need no browser.
-    import shutil
-
-    from axe_playwright_python.sync_playwright import Axe
-    from playwright.sync_api import sync_playwright
-
+def test_the_page_is_accessible_and_fits_a_phone(tmp_path, scheme):
+    """axe-core finds no serious barrier, and the page scrolls vertically only."""
     page = Page(
         tmp_path,
         *(finding(each, reason="x" * 300, is_headline=False) for each in Outcome),
@@ -143,18 +135,10 @@ def test_the_page_keeps_nobody_out(tmp_path, scheme):
         inputs={"recording 0.u": {"camera": "side"}},
         facts={"versions": {"mujoco": "3.17.0"}},
     )
-    with sync_playwright() as playwright:
-        found = shutil.which("chromium") or playwright.chromium.executable_path
-        browser = playwright.chromium.launch(
-            executable_path=found, args=["--no-sandbox"]
-        )
-        size = {"width": 360, "height": 800}
-        with browser.new_context(viewport=size, color_scheme=scheme) as context:
-            shown = context.new_page()
-            shown.goto(page.path.as_uri())
-            shown.evaluate("document.querySelector('details').open = true")
-            assert shown.evaluate("document.scrollingElement.scrollWidth") <= 360
-            violations = Axe().run(shown).response["violations"]
-        browser.close()
-    bad = [v["id"] for v in violations if v["impact"] in ("serious", "critical")]
-    assert bad == []
+    viewport = {"width": 360, "height": 800}
+    with chromium() as launch, launch() as browser:
+        shown = browser.new_page(viewport=viewport, color_scheme=scheme)
+        shown.goto(page.path.as_uri())
+        shown.evaluate("document.querySelector('details').open = true")
+        assert shown.evaluate("document.scrollingElement.scrollWidth") <= 360
+        assert barriers_of(shown) == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of verifications, by hand: to be shown, summed up and judged."""
+"""Findings, excuses and results of verifications."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def finding(outcome=Outcome.RECREATED, **changes):
 
 
 def excuse(**changes):
-    """Return the excuse of another renderer."""
+    """Return the excuse that another GPU rendered."""
     usual = {"kind": ExcuseKind.HARDWARE, "name": "gl", "costs": "frames are alike"}
     usual |= {"claimed": "NVIDIA H100", "here": "llvmpipe"}
     return Excuse(**{**usual, **changes})
