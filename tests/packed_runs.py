@@ -9,7 +9,7 @@ import zipfile
 import gymnasium
 
 import mjrec
-from mjrec.evidence.compare_descriptions import written_again
+from mjrec.evidence.compare_descriptions import rewritten
 from mjrec.json_text import dumps
 
 
@@ -50,11 +50,11 @@ def make_bag_fit(bag):
     _write_manifest(bag, "tagmanifest-sha512.txt", sorted(tags))
 
 
-def describe_again(bag):
+def rewrite_descriptions(bag):
     """Rewrite all descriptions of a packed run from its recordings."""
     # Descriptions contain sizes, which the first round changes.
     for _ in range(2):
-        for name, text in written_again(bag).items():
+        for name, text in rewritten(bag).items():
             is_tag = (bag / name).exists()
             (bag / name if is_tag else bag / "data" / name).write_text(text)
 

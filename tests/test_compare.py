@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from imageio.v3 import imwrite
-from packed_runs import describe_again, edit_json, the, unpacked
+from packed_runs import edit_json, rewrite_descriptions, the, unpacked
 
 import honest_runs
 import mjrec
@@ -50,7 +50,7 @@ def made(packed, tmp_path):
 def compared(given, made, *, is_described=False, **options):
     """Update descriptions unless `is_described`, then compare two runs."""
     if not is_described:
-        describe_again(given)
+        rewrite_descriptions(given)
     comparison = Comparison(given, made, **options)
     level, findings = options.get("level", Level.PIXELS), tuple(comparison)
     return Verification(
@@ -231,7 +231,7 @@ EDITS = [
 ]
 
 
-def test_equal_runs_are_made_again(packed):
+def test_equal_runs_have_no_differences(packed):
     """Every topic is reported with its count."""
     verification = compared(packed, packed)
     assert verification.verdict is Verdict.PASS

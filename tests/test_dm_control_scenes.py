@@ -70,7 +70,7 @@ def test_overridden_render_of_physics_is_an_obstacle():
     assert "Physics overrides render()" in dm_control_scenes(env).obstacle
 
 
-def test_environment_facts_suffice_to_make_it_again():
+def test_environment_facts_suffice_to_recreate_it():
     """The facts include the state of the random generator."""
 
     class Opaque:

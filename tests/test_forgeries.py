@@ -21,7 +21,7 @@ import gymnasium
 import h5py
 import numpy as np
 import pytest
-from packed_runs import describe_again, edit_json, make_bag_fit, the, unpacked
+from packed_runs import edit_json, make_bag_fit, rewrite_descriptions, the, unpacked
 from parts import parametrize
 
 import honest_runs as honest
@@ -527,14 +527,14 @@ def pending_worst(bag):
     run.edit_details(
         pending=[{"episode_id": 0, "video": name, "trajectory": trajectory}]
     )
-    describe_again(bag)
+    rewrite_descriptions(bag)
 
 
 def say_it_was_made_smaller(bag):
     """Claim that packing reduced the video, which would excuse blurred frames."""
     run = ForgedRun(bag / "data/recordings")
     run.edit_json("*000001.meta.json", packed_smaller={"from": [480, 480]})
-    describe_again(bag)
+    rewrite_descriptions(bag)
 
 
 def scaled_up(frame):
@@ -714,7 +714,7 @@ def add_a_video(bag):
     """Add a video whose recording does not exist."""
     path = the(bag, "*.video000001.mp4")
     shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.w.")))
-    describe_again(bag)
+    rewrite_descriptions(bag)
 
 
 def add_a_line(run):
@@ -743,7 +743,7 @@ def add_a_line_about_rows(bag):
     lines = path.read_text().splitlines()
     rows = json.dumps({"note": {"name": "all goals reached"}})
     path.write_text("\n".join([*lines[:2], rows, *lines[2:]]) + "\n")
-    describe_again(bag)
+    rewrite_descriptions(bag)
 
 
 def add_a_file(name):

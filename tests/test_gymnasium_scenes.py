@@ -176,7 +176,7 @@ def test_requested_camera_is_a_name_a_number_or_an_object():
         gymnasium_scenes(env, height=0)
 
 
-def test_environment_facts_suffice_to_make_it_again():
+def test_environment_facts_suffice_to_recreate_it():
     """The facts are JSON, with the smallest step limit and only relevant wrappers."""
     env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
     environment = gymnasium_scenes(env).environment

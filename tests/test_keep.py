@@ -187,8 +187,8 @@ def test_trajectories_are_kept_apart_from_videos(tmp_path, options, kept):
     assert numbers(tmp_path.glob("*.h5")) == kept
     if not options["workers"]:
         paths = sorted(tmp_path.glob("*.h5"))
-        promised = [mjrec.load_trajectory(path).facts["video"] for path in paths]
-        assert [bool(each) for each in promised] == [False, False, True, False]
+        planned = [mjrec.load_trajectory(path).facts["video"] for path in paths]
+        assert [bool(each) for each in planned] == [False, False, True, False]
         mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [2]
     assert numbers(in_flight(tmp_path)) == []

@@ -144,7 +144,7 @@ def test_what_cannot_be_made_is_refused(said):
     refusal({})
 
 
-def test_gymnasiums_own_wrappers_are_made_again():
+def test_gymnasium_wrappers_are_recreated():
     """Wrappers keep their arguments and order."""
     env = ClipAction(RescaleAction(gymnasium.make("HalfCheetah-v5"), -2, 2))
     again = recreate(facts("HalfCheetah-v5", **around_gymnasium(env))).environment
@@ -241,7 +241,7 @@ def test_options_of_a_reset_are_plain():
 
 
 @pytest.mark.dm_control
-def test_a_task_of_the_suite_is_made_again():
+def test_a_task_of_the_suite_is_recreated():
     """The task keeps its arguments, and its generator's state reveals the seed."""
     pytest.importorskip("dm_control.suite")
     kwargs = {"task_kwargs": {"random": 5, "time_limit": 0.2}}

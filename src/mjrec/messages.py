@@ -105,10 +105,10 @@ def log_message(message: Mapping[str, Any]) -> bool:
 def carried(error: BaseException) -> dict[str, Any]:
     """Convert an error to plain JSON values, from which `unpacked` rebuilds it."""
     if not isinstance(error, Error):
-        told = "".join(traceback.format_exception(error)).strip()
+        text = "".join(traceback.format_exception(error)).strip()
         return {
             "type": "Error",
-            "message": f"A worker failed with an unexpected error.\n{told}",
+            "message": f"A worker failed with an unexpected error.\n{text}",
         }
     # A module's private error class is sent as its nearest public base class.
     kinds = (kind.__name__ for kind in type(error).__mro__)

@@ -139,15 +139,15 @@ def enter() -> tuple[Any, Callable[..., None]]:
         The request, and a function that sends its keyword arguments to the parent.
     """
     parent = Parent()
-    told = parent.receive()
-    for name, wanted in told["limits"].items():
+    received = parent.receive()
+    for name, wanted in received["limits"].items():
         kind = getattr(resource, name)
         _, most = resource.getrlimit(kind)
         allowed = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
         resource.setrlimit(kind, (allowed, allowed))
     # When the parent ends, kill the whole process group.
     parent.listen(lambda: os.killpg(0, signal.SIGKILL))
-    return told["request"], lambda **answers: parent.send(**_plain(answers))
+    return received["request"], lambda **answers: parent.send(**_plain(answers))
 
 
 def _is_kept(name: str) -> bool:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -128,9 +129,13 @@ def _summary(directory: Path) -> tuple[str, bool]:
         return f"cannot be read: {error}", False
     parts = [counted(len(episodes), "episode")]
     if episodes:
-        returns = sorted(episode.reward for episode in episodes)
-        low, high = f"{returns[0]:.4g}", f"{returns[-1]:.4g}"
-        parts.append(f"return {low}" if low == high else f"return {low} to {high}")
+        rewards = [episode.reward for episode in episodes]
+        finite = [reward for reward in rewards if math.isfinite(reward)]
+        if finite:
+            low, high = f"{min(finite):.4g}", f"{max(finite):.4g}"
+            parts.append(f"return {low}" if low == high else f"return {low} to {high}")
+        if others := len(rewards) - len(finite):
+            parts.append(f"{counted(others, 'return')} NaN or infinite")
     pending = sum(episode.pending for episode in episodes)
     videos = sum(episode.video is not None for episode in episodes)
     parts.append(counted(videos, "video") + f" and {pending} pending" * bool(pending))

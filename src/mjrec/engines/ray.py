@@ -209,14 +209,14 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
     except Exception as error:
         with contextlib.suppress(Exception):
             ray.shutdown()
-        told = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         if address == "local":
-            why = f"Ray could not be started on this machine: {told}"
+            why = f"Ray could not be started on this machine: {reason}"
         else:
             why = (
                 f"No Ray cluster answers at {address}. It must be running (ray "
                 "status), be reachable from this machine, and have the same versions "
-                f"of Ray and Python. Ray's error: {told}"
+                f"of Ray and Python. Ray's error: {reason}"
             )
         raise Error(why) from error
 

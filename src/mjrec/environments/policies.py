@@ -317,5 +317,5 @@ def _log_traceback(error: BaseException, *where: object) -> None:
         own = error.__traceback__
         while own is not None and own.tb_frame.f_code.co_filename == __file__:
             own = own.tb_next
-        told = traceback.format_exception(type(error), error, own)
-        logger.warning("%s", "".join(told).rstrip())
+        lines = traceback.format_exception(type(error), error, own)
+        logger.warning("%s", "".join(lines).rstrip())

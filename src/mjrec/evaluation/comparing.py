@@ -141,7 +141,7 @@ def compare(
     if not common:
         raise InvalidArgument(
             "The evaluations have no task in common: "
-            + "; ".join(f"{side.told} has {', '.join(side.tasks)}" for side in sides)
+            + "; ".join(f"{side.label} has {', '.join(side.tasks)}" for side in sides)
         )
     is_single = len(of_a.results) == len(of_b.results) == 1
     unknown = {task: of_a.unknown(task) or of_b.unknown(task) for task in common}
@@ -225,13 +225,13 @@ class _Side:
             directories = [directories]
         self.name = name
         self.directories = tuple(map(Path, directories))
-        self.told = f"{name} ({', '.join(map(str, self.directories))})"
+        self.label = f"{name} ({', '.join(map(str, self.directories))})"
         if not self.directories:
             raise InvalidArgument(
                 f"Side {name} has no evaluation. Give at least one directory."
             )
         if len({path.resolve() for path in self.directories}) < len(self.directories):
-            raise InvalidArgument(f"An evaluation was given twice: {self.told}.")
+            raise InvalidArgument(f"An evaluation was given twice: {self.label}.")
         self.results = [read_results(path) for path in self.directories]
         first, *rest = (each.by_task for each in self.results)
         # The tasks that all evaluations have in common.

@@ -30,7 +30,7 @@ _LONGEST_FILE: Final = 1 << 28
 def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
     """Compare the descriptions of a bag with regenerated ones."""
     try:
-        texts = written_again(bag)
+        texts = rewritten(bag)
     except Error as error:
         reason = error.reason if isinstance(error, UnreadableFile) else str(error)
         yield _difference(ENVIRONMENT, f"descriptions cannot be regenerated: {reason}")
@@ -45,7 +45,7 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
             yield _compare(name, there[name], texts[name])
 
 
-def written_again(bag: Path) -> dict[str, str]:
+def rewritten(bag: Path) -> dict[str, str]:
     """Return a bag's descriptions, regenerated from its recordings, keyed by file name.
 
     Raises:

@@ -63,7 +63,7 @@ def _choose(
     group: list[RecordingInputs], rule: str, directory: Path, notes: list[Finding]
 ) -> None:
     choices = _stated(group)
-    again = _made_again(group, rule, directory)
+    again = _recreated(group, rule, directory)
     if choices.keys() == again.keys():
         choices = again
     else:
@@ -100,7 +100,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
     return found
 
 
-def _made_again(
+def _recreated(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
     """Return the episodes that the rule chooses from all replayed episodes."""

@@ -119,12 +119,12 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..environments.recreate import NotRecreated
     from ..formats.monitor_directory import infix_of, iter_monitor_files
     from ..rendering.recovery import recover
-    from .draw_again import draw_all, draw_sample
     from .evaluation_choice import choose_for_evaluations
     from .excuses import note, write_notes
-    from .make_again import Making, play_recording
     from .pack import pack_folder
     from .read_inputs import packing_options
+    from .recreate_run import Recreation, play_recording
+    from .render_recreated import draw_all, draw_sample
 
     level, folder = Level(request["level"]), Path(request["folder"], INPUTS)
     made = Path(request["folder"], MADE)
@@ -144,7 +144,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
         counter(min(taken, steps - 1), steps)
 
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
-        making = Making(
+        recreation = Recreation(
             directory=played,
             arrays=arrays,
             trust=frozenset(request["trust"]),
@@ -154,7 +154,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
         )
         for recording in inputs.recordings:
             try:
-                play_recording(recording, making)
+                play_recording(recording, recreation)
             except NotRecreated as error:
                 # Part of a recording proves nothing.
                 for path in iter_monitor_files(played, hidden=True):

@@ -194,8 +194,8 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
     items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
     of = f" of {listed(items or excuse.items, _MOST_ITEMS)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
-    told = f"; {', '.join(costs)}" if costs else ""
-    return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{told}"
+    counts = f"; {', '.join(costs)}" if costs else ""
+    return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{counts}"
 
 
 def _claim(excuse: Excuse) -> str:

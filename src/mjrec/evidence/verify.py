@@ -192,13 +192,13 @@ def _run(
     on_progress: Callable[[VerificationProgress], object] | None,
 ) -> str | None:
     """Run a process and add its messages to `heard`; return the reason if it failed."""
-    told = on_progress or (lambda _: None)
+    report = on_progress or (lambda _: None)
     began, failure = time.monotonic(), None
 
     def show(done: int, total: int) -> None:
         passed = time.monotonic() - began
         left = passed * (total - done) / done if done > 0 else None
-        told(VerificationProgress(phase, done, total, left))
+        report(VerificationProgress(phase, done, total, left))
 
     show(0, 1)
     with Sandbox(MODULE, request, place=place, readable=readable) as sandbox:

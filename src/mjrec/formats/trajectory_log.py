@@ -112,7 +112,7 @@ def _reader_of(
             return ModelChange(step=step, fields=fields)
 
     endings = flags[is_step][1:]
-    promised = stop if recording.stop is None else max(stop, recording.stop)
+    expected = stop if recording.stop is None else max(stop, recording.stop)
     return TrajectoryReader(
         path=path,
         facts=dict(recording.facts),
@@ -123,7 +123,7 @@ def _reader_of(
         truncated=endings & TRUNCATED != 0,
         frame_steps=numbers[is_frame],
         change_count=len(changes),
-        dropped=max(0, promised - first) - len(flags),
+        dropped=max(0, expected - first) - len(flags),
         read=read,
         read_change=read_change,
         release=opened.pop_all().close,

@@ -197,7 +197,7 @@ class _Clip:
             if self.live is not None:
                 run.note("clip", {**said, "recording": LIVE})
                 run.trackers.expect(self._video)
-                self.live.name_again()
+                self.live.give_second_names()
             # Otherwise, the disk was too full for even a single row, and there will be
             # no video.
             elif self._parts > 1 or (self._part is not None and self._part.is_there):

@@ -119,15 +119,15 @@ class LiveVideos:
                     failures.note(error)
         if not all(recorder.closed for recorder in self.recorders):
 
-            def end_again() -> None:
+            def retry_end() -> None:
                 self.end(facts)
-                self.name_again()
+                self.give_second_names()
 
             # The disk had no room for some of the metadata.
-            self._run.retry_at_close(end_again)
+            self._run.retry_at_close(retry_end)
         failures.raise_first()
 
-    def name_again(self) -> None:
+    def give_second_names(self) -> None:
         """Give the finished videos their second names, if they have any."""
         first = self.recorders[0]
         if first.finished and "also_named" in first.metadata:

@@ -168,7 +168,7 @@ class EpisodeRecording:
         if self.mode is not None and self._run.trackers:
             self._run.trackers.expect(Path(str(self.video.path)))
         if self.live is not None:
-            self.live.name_again()
+            self.live.give_second_names()
 
     def choose(self, selection: Mapping[str, Any]) -> None:
         """Keep the video of an episode that was chosen after its end.

@@ -54,7 +54,7 @@ _SECONDS_BETWEEN_REPORTS = 0.2
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
 # The child process itself gives up after one timeout, so wait for several timeouts.
-_PATIENCES = 3
+_TIMEOUTS = 3
 
 
 class Background:
@@ -143,7 +143,7 @@ class Background:
         """
         if self._was_forked() or self._is_stopped or self._waits_later:
             return
-        timeout, cpu_seconds = Timeout(_PATIENCES * timeout_s()), 0.0
+        timeout, cpu_seconds = Timeout(_TIMEOUTS * timeout_s()), 0.0
         while self.waiting and (child := self._child) is not None:
             if not self._is_waited_for:
                 # If the process has died, this replaces it.

@@ -77,7 +77,7 @@ def write_choice(
             if metadata_path(video).exists():
                 amend_metadata(video, {"selection": selection})
         others = {key: selections[key] for key in selections if key not in filmed}
-        can_be_drawn = filmed | _promise_videos(folder, others)
+        can_be_drawn = filmed | _make_pending(folder, others)
         drawable |= can_be_drawn
         own = {key.number for key in can_be_drawn}
         before = set((run.keep or {}).get("recorded", ()))
@@ -98,7 +98,7 @@ def write_choice(
     return drawable
 
 
-def _promise_videos(
+def _make_pending(
     folder: Path, selections: Mapping[RecordingKey, Mapping[str, Any]]
 ) -> set[RecordingKey]:
     """Mark videos as pending in trajectories; return the episodes that can have one.
@@ -117,8 +117,8 @@ def _promise_videos(
             facts = reader.facts
         video, possible = facts.get("video"), facts.get("possible_video")
         if possible is not None and (video or {}).get("selection") != selection:
-            promise = {**possible, "selection": selection}
-            changes[path] = functools.partial(_with_video, promise)
+            pending = {**possible, "selection": selection}
+            changes[path] = functools.partial(_with_video, pending)
         if possible is not None or video is not None:
             drawable.add(key)
     amend_trajectories(changes)

@@ -188,5 +188,7 @@ def _files(results: MonitorResults, number: int) -> dict[str, Any]:
         "video": video,
         "metadata": metadata,
         "trajectory": trajectory,
-        "pending": is_missing and not is_left_out and number in results.promised,
+        "pending": is_missing
+        and not is_left_out
+        and number in results.with_deferred_video,
     }

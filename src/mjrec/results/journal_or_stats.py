@@ -95,13 +95,13 @@ class MonitorResults:
         return replace(of_manifest, count=run.count, last_episode_id=last)
 
     @functools.cached_property
-    def promised(self) -> set[int]:
+    def with_deferred_video(self) -> set[int]:
         """The episodes whose videos are rendered from their states, now or later.
 
         Raises:
             UnreadableFile: see `run`.
         """
-        return self.run.promised
+        return self.run.with_deferred_video
 
     @property
     def details(self) -> Mapping[str, Any]:

@@ -256,7 +256,7 @@ def _pending(directory: Path, infix: str, run: Run) -> list[Mapping[str, Any]]:
             "trajectory": trajectory_prefix(infix, number),
             "video": f"{video_prefix(infix, number)}.mp4",
         }
-        for number in sorted(run.promised)
+        for number in sorted(run.with_deferred_video)
     ]
     clips = [
         clip

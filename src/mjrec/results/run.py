@@ -107,7 +107,7 @@ class Run:
         return run
 
     @property
-    def promised(self) -> set[int]:
+    def with_deferred_video(self) -> set[int]:
         """The episodes whose videos are rendered from their states, now or later."""
         keep = self.keep or {}
         if keep.get("decided") is True:

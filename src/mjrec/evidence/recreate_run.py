@@ -34,7 +34,7 @@ from ..simulation.model_sources import read_authored
 from .excuses import note, read_notes, write_notes
 from .findings import Finding
 from .inputs import EpisodeInputs, RecordingInputs, given_actions
-from .recorder_again import monitor_again
+from .recreated_monitor import recreated_monitor
 
 # A limit, because steps without recorded actions are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
@@ -52,7 +52,7 @@ _MODES = {"e": "evaluation"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Making:
+class Recreation:
     """The facts shared by all recordings of the run that is being recreated.
 
     Attributes:
@@ -73,7 +73,7 @@ class Making:
     on_step: Callable[[], object]
 
 
-def play_recording(recording: RecordingInputs, making: Making) -> None:
+def play_recording(recording: RecordingInputs, recreation: Recreation) -> None:
     """Replay a recording into a monitor directory, and leave its videos pending.
 
     Raises:
@@ -84,24 +84,24 @@ def play_recording(recording: RecordingInputs, making: Making) -> None:
     if recording.environment is None:
         reason = "the journal does not name its environment"
         raise NotRecreated(reason, excuse="environment")
-    directory = making.directory
+    directory = recreation.directory
     mjcf, is_elsewhere = None, recording.is_elsewhere
-    sources = making.sources / (recording.sources or "")
+    sources = recreation.sources / (recording.sources or "")
     if sources.is_file():
         mjcf = _unpack_sources(sources, directory.parent, is_elsewhere=is_elsewhere)
     recreated = recreate(
         recording.environment,
         own_camera=recording.options.get("own_camera"),
-        trust=making.trust,
+        trust=recreation.trust,
         mjcf=mjcf,
         is_elsewhere=is_elsewhere,
     )
     if recreated.turns_by_rk4():
         reason = "MuJoCo 4.0 rotates free bodies differently with the integrator RK4"
         count = len(recording.episodes)
-        making.notes.append(note(recording.name, "rk4", reason, count=count))
+        recreation.notes.append(note(recording.name, "rk4", reason, count=count))
     if not recording.was_killed:
-        _Playing(recording, recreated, making).run()
+        _Playing(recording, recreated, recreation).run()
         return
     refusal = directory.with_name(f"{recording.infix}.refusal")
     # A child process is killed in the same place, so that it leaves the same files.
@@ -109,7 +109,7 @@ def play_recording(recording: RecordingInputs, making: Making) -> None:
     if child == 0:
         with contextlib.suppress(BaseException):
             try:
-                _Playing(recording, recreated, making).run()
+                _Playing(recording, recreated, recreation).run()
             except NotRecreated as error:
                 refusal.write_text(json.dumps([str(error), error.excuse]))
         # Only reached if the replay failed: a successful one kills the process.
@@ -120,7 +120,7 @@ def play_recording(recording: RecordingInputs, making: Making) -> None:
         if refusal.exists():
             reason, excuse = json.loads(refusal.read_text())
         raise NotRecreated(reason, excuse=excuse)
-    making.notes[:] = read_notes(directory.parent)
+    recreation.notes[:] = read_notes(directory.parent)
     if not recording.has_sources:
         # A thread may have stored the sources just before the kill.
         for path in directory.glob("openaigym.model.*.zip"):
@@ -133,24 +133,24 @@ class _Playing:
     Args:
         recording: the recording's inputs.
         recreated: the recording's environment, recreated.
-        making: the facts shared with the run's other recordings.
+        recreation: the facts shared with the run's other recordings.
     """
 
     def __init__(
-        self, recording: RecordingInputs, recreated: Recreated, making: Making
+        self, recording: RecordingInputs, recreated: Recreated, recreation: Recreation
     ) -> None:
         self._recording, self._recreated = recording, recreated
-        self._making = making
+        self._recreation = recreation
         self._now = 0.0
         self._warned: Mapping[str, int] = {}
         self._events = [*recording.evaluation_events]
         # A monitor for Gymnasium or dm_env.
-        self._monitor: Any = monitor_again(
+        self._monitor: Any = recreated_monitor(
             recording,
             recreated,
-            making.directory,
+            recreation.directory,
             clock=lambda: self._now,
-            notes=making.notes,
+            notes=recreation.notes,
         )
 
     def run(self) -> None:
@@ -200,7 +200,7 @@ class _Playing:
         if self._recording.has_sources:
             recorder.finish_models()
         if self._recording.was_killed:
-            write_notes(self._making.directory.parent, self._making.notes)
+            write_notes(self._recreation.directory.parent, self._recreation.notes)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
 
@@ -275,7 +275,7 @@ class _Playing:
         This is done only if nothing else reproduces that state: no seed was recorded,
         and the environment has no random generator.
         """
-        known = self._making.arrays.get(f"{episode.arrays}.state")
+        known = self._recreation.arrays.get(f"{episode.arrays}.state")
         base = getattr(self._recreated.environment, "unwrapped", None)
         if known is None or base is None or self._recreated.random_state() is not None:
             yield
@@ -301,13 +301,13 @@ class _Playing:
         """Take the recorded actions of an episode until the environment ends it."""
         take, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
-        states = self._making.arrays.get(f"{episode.arrays}.states")
+        states = self._recreation.arrays.get(f"{episode.arrays}.states")
         self._break_videos(episode)
-        for step, action in enumerate(given_actions(episode, self._making.arrays)):
+        for step, action in enumerate(given_actions(episode, self._recreation.arrays)):
             if states is not None:
                 self._recreated.put_into(states[step : step + 1])
             result = take(action)
-            self._making.on_step()
+            self._recreation.on_step()
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
         self._note_stand_in(episode)
@@ -328,7 +328,7 @@ class _Playing:
             )
 
     def _begin_stand_in(self, episode: EpisodeInputs) -> None:
-        stand_in, arrays = self._recreated.stand_in, self._making.arrays
+        stand_in, arrays = self._recreated.stand_in, self._recreation.arrays
         if stand_in is None:
             return
         if f"{episode.arrays}.controls" not in arrays:
@@ -423,7 +423,7 @@ class _Playing:
         """Note what is believed about an episode, or about the whole recording."""
         recording = self._recording
         item = recording.name if episode is None else recording.item(episode)
-        self._making.notes.append(note(item, excuse, reason))
+        self._recreation.notes.append(note(item, excuse, reason))
 
 
 def _exception_kind(name: str) -> type[BaseException]:

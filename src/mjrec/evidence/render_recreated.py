@@ -80,10 +80,10 @@ def _pending(directory: Path) -> Iterator[tuple[str, Path, int, Any]]:
             continue
         [trajectory] = plan.parts
         with open_trajectory(trajectory) as reader:
-            promise: Mapping[str, Any] = reader.facts.get("video") or {}
+            video_facts: Mapping[str, Any] = reader.facts.get("video") or {}
             count = reader.frame_count
-        if promise.get("annotate") or promise.get("tiled"):
+        if video_facts.get("annotate") or video_facts.get("tiled"):
             continue
-        cameras = [None, *promise.get("cameras", ())[1:]]
+        cameras = [None, *video_facts.get("cameras", ())[1:]]
         for video, camera in zip(plan.videos, cameras, strict=True):
             yield video.name, trajectory, count, camera

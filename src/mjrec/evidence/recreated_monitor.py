@@ -37,7 +37,7 @@ _UNCHANGED = (
 _SCHEDULE = re.compile(r"(every|at):[\d,]+", re.ASCII)
 
 
-def monitor_again(
+def recreated_monitor(
     recording: RecordingInputs,
     recreated: Recreated,
     directory: Path,
