@@ -29,7 +29,12 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.formats.locks import Lock, is_locked, try_lock
-from mjrec.formats.monitor_directory import lock_name, log_name, video_prefix
+from mjrec.formats.monitor_directory import (
+    infix_of,
+    lock_name,
+    log_name,
+    video_prefix,
+)
 
 # A corridor or a cheetah runs for 12 steps; `code` says what to do.
 PROGRAM = f"""
@@ -335,6 +340,23 @@ def test_a_killed_deferred_run_keeps_its_provenance(tmp_path):
     digest = hashlib.sha256(b"weights").hexdigest()
     assert provenance["policy"] == {"file": str(policy), "sha256": digest}
     assert_in_order(directory)
+
+
+def test_recovery_does_not_wait_for_rendering(tmp_path):
+    """Another process may be rendering a pending video of the killed monitor."""
+    directory = kill(
+        "import gymnasium\nenv = gymnasium.make('InvertedPendulum-v5', width=48,"
+        " height=32, max_episode_steps=2)\n"
+        "run(monitor(env, workers=0), 2)\ndie()",
+        tmp_path,
+    )
+    [log] = directory.glob("openaigym.states.*.log")
+    infix = infix_of(log.name)
+    # The process that renders a video holds this lock.
+    with try_lock(directory / f".{video_prefix(infix, 0)}.lock"):
+        mjrec.recover(directory, timeout=3600)
+    # The renderer finishes its own recording.
+    assert manifest_of(directory)["videos"] == []
 
 
 # --- journal and logs ----------------------------------------------------------------

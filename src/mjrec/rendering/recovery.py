@@ -14,7 +14,7 @@ from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .recovery_needed import is_at_work, needs_recovery, stale_shared_files
+from .recovery_needed import is_encoding, needs_recovery, stale_shared_files
 
 # Only one process at a time may recover a directory.
 _LOCK = ".openaigym.recover.lock"
@@ -127,7 +127,7 @@ def recover(
     if not os.access(path, os.W_OK | os.X_OK):
         raise DirectoryNotWritable(path, "permission denied")
     # Wait for encoders before taking any lock.
-    while time.monotonic() < deadline and any(is_at_work(path, each) for each in dead):
+    while time.monotonic() < deadline and any(is_encoding(path, each) for each in dead):
         time.sleep(_MOMENT)
     with wait_for_lock(path / _LOCK):
         # Look again, because another process may have recovered them in the meantime.

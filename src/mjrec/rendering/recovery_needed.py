@@ -52,11 +52,10 @@ def needs_recovery(files: MonitorFiles) -> bool:
     return bool(found) or lacks_results(files)
 
 
-def is_at_work(directory: Path, infix: str) -> bool:
-    """Return whether a process still encodes or renders for a dead monitor."""
-    files = files_of(directory, infix)
-    hidden = [path for path in files.paths if path.name.startswith(".")]
-    return any(is_locked(path) for path in hidden if path != files.lock)
+def is_encoding(directory: Path, infix: str) -> bool:
+    """Return whether an encoder is still completing a live video of a dead monitor."""
+    videos = live_videos_left(files_of(directory, infix))
+    return any(is_locked(part) for video in videos for part in unfinished_files(video))
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
