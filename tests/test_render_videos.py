@@ -267,7 +267,7 @@ def test_workers_get_environment_models_and_an_absolute_path(
     (tmp_path / f"openaigym.model.{digest[:16]}.mjb.gz").touch()
     engine = InlineExecutor()
     render_videos(Path(), engine=engine)
-    environ = {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
+    environ = {"LP_NUM_THREADS": "0", "MJREC_TRUST_MODELS": "1"}
     assert engine.work["environ"] == environ
     assert engine.work["settings"] == {"models": [digest]}
     assert engine.jobs[0]["arguments"]["directory"] == str(tmp_path)

@@ -18,8 +18,6 @@ from ..errors import Error
 from ..signals import exiting_on_signals
 from .overview import EXAMPLES, examples, overview, recordings_in
 
-__all__ = ["main"]
-
 # The module and the summary of each command. The module is imported when the command
 # runs, and its function has the module's name (`list_episodes`, because `list` is a
 # builtin).

@@ -37,7 +37,7 @@ from .recordings import may_be_left, recordings
 from .recovery import recover
 
 _WORKER = "mjrec.rendering.finish:VideoWorker"
-_RASTERISER_THREADS = "LP_NUM_THREADS"
+_RASTERIZER_THREADS = "LP_NUM_THREADS"
 
 _OnProgress = Callable[[Progress], object]
 
@@ -206,8 +206,8 @@ def _result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
 
 def environ_for_drawing() -> dict[str, str]:
     """Return environment variables for workers that draw, on any machine."""
-    # In each of several workers, Mesa's rasterizer would start one thread per CPU.
-    environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
+    # In each worker, Mesa's rasterizer would start one thread per CPU.
+    environ = {_RASTERIZER_THREADS: os.environ.get(_RASTERIZER_THREADS, "0")}
     if TRUST_VARIABLE in os.environ:
         # Workers on other machines do not inherit this variable from this process.
         environ[TRUST_VARIABLE] = os.environ[TRUST_VARIABLE]
