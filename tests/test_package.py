@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test the wheel's content and metadata, and its use without a checkout."""
+"""Test the packages' content and metadata, and the wheel without a checkout."""
 
 import email
 import os
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -17,16 +18,31 @@ SOURCE = ROOT / "src"
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """Build the wheel without a network, and return its files."""
+def packages(tmp_path_factory):
+    """Build as `scripts/build` does: the sdist, and from it the wheel."""
     pytest.importorskip("build", reason="the tools for packages are missing")
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
+    folder = tmp_path_factory.mktemp("packages")
+    command = [sys.executable, "-m", "build", "--no-isolation"]
     command += ["--outdir", str(folder), str(ROOT)]
     subprocess.run(command, check=True, capture_output=True, timeout=280)
-    [path] = folder.glob("*.whl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(packages):
+    """Return the wheel's files."""
+    [path] = packages.glob("*.whl")
     with zipfile.ZipFile(path) as packed:
         return {name: packed.read(name) for name in packed.namelist()}
+
+
+def test_sdist_contains_what_testing_needs_but_no_environment(packages):
+    [path] = packages.glob("*.tar.gz")
+    with tarfile.open(path) as packed:
+        names = {name.partition("/")[2] for name in packed.getnames()}
+    needed = ("src/mjrec/py.typed", "tests/conftest.py", "scripts/test", "README.md")
+    assert names.issuperset(needed)
+    assert not [name for name in names if name.startswith((".venv", ".git/"))]
 
 
 def test_wheel_contains_exactly_the_package(wheel):
