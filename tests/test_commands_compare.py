@@ -22,7 +22,7 @@ def write(tmp_path):
 
 @pytest.fixture
 def two(write):
-    """Return two evaluations, of which the second is better on the first task."""
+    """Return two evaluations; the second is better on the first task."""
     return [
         write("a", WORSE, policy="mine:old"),
         write("b", BETTER, policy="mine:new", policy_kwargs={"gain": 2}),

@@ -36,7 +36,7 @@ STATED = {
 
 @pytest.fixture(scope="module")
 def recorded(pendulums):
-    """Return a directory with three episodes, of which two have a video."""
+    """Return a directory with three episodes, two of them with a video."""
     return pendulums(3)
 
 

@@ -23,11 +23,11 @@ def report(
     /,
     *,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report"),
-    single_file: bool = False,
-    max_single_file_bytes: int = 50_000_000,
-    replay: bool = False,
     title: str | None = None,
+    single_file: bool = False,
+    replay: bool = False,
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
+    max_single_file_bytes: int = 50_000_000,
     as_json: AsJson = False,
 ) -> int:
     """Make a web page from recordings: figures, curves, videos and their provenance.
@@ -40,15 +40,15 @@ def report(
         directories: evaluations, monitor directories, or folders that contain them.
         out: the folder to write. An existing report is replaced; any other non-empty
             folder is left alone.
+        title: title of the page.
         single_file: embed images and videos in the page itself. --out may then name
             the page.
-        max_single_file_bytes: size limit of that page. Videos that do not fit are left
-            out, with a note.
         replay: add a 3D page next to the videos of the best, median and worst episodes.
             Creating that page requires MuJoCo. It is loaded only when opened.
-        title: title of the page.
         verification: output of mjrec verify --json. May be repeated. A
             verification.json in a directory is found automatically.
+        max_single_file_bytes: size limit of a single file. Videos that do not fit are
+            left out, with a note.
         as_json: print one JSON object at the end.
     """
     console = rich.console.Console(stderr=True)

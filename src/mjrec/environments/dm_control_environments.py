@@ -84,7 +84,7 @@ def load_task(
         env_id: `dm_control/<domain>-<task>`.
         kwargs: arguments for `suite.load`; None if a recording lacks them. In that
             case, recordings of the returned environment also lack them.
-        options: the options, of which only `max_steps` applies.
+        options: the options; only `max_steps` applies.
     """
     environment = suite.load(*task_of_suite(env_id), **(kwargs or {}))
     if kwargs is not None:
