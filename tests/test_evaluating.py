@@ -167,7 +167,7 @@ def engines(tmp_path_factory):
 @parametrize(
     ("kind", "workers"),
     [("local", 5), ("ray", 2), ("slurm", 2), ("local", 2), ("dask", 2)],
-    default=3,
+    default=1,
 )
 def test_engines_produce_the_files_of_one_worker(
     by_one_worker, engines, tmp_path, kind, workers

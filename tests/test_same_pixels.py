@@ -184,7 +184,6 @@ def record_dm(env, directory, camera):
     "domain, task, visualize_reward",
     [(*task, reward) for task in suite_tasks() for reward in (False, True)],
     ("finger", "turn_easy", True),
-    ("quadruped", "escape", False),
 )
 def test_suite(domain, task, visualize_reward, workers, tmp_path):
     """Each task is rendered from each camera; `visualize_reward` changes colors."""

@@ -36,7 +36,7 @@ GL_FRAMES = finding(
         (verification(finding()), "PASS  run.zip: everything was recreated"),
         (
             verification(finding(), GL_FRAMES, excuses=(excuse(allowed=True),)),
-            "is equal, or allowed (gl).",
+            "matches or is allowed (gl).",
         ),
         (verification(finding(), GL_FRAMES), "PARTLY  run.zip: nothing contradicts"),
         (

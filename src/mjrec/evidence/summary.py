@@ -72,7 +72,7 @@ def headline(verification: Verification) -> str:
     match verification.verdict:
         case Verdict.PASS:
             taken = [e.name for e in verification.excuses if e.allowed]
-            allowed = f", or allowed ({', '.join(taken)})" if taken else ""
+            allowed = f" or is allowed ({', '.join(taken)})" if taken else ""
             return f"{name}: everything was recreated and matches{allowed}."
         case Verdict.PARTLY if verification.level is Level.FILES:
             return f"{name}: files are unchanged; nothing was recreated."
