@@ -525,7 +525,7 @@ def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
         for radius in (0.05, 0.2):
             run.unwrapped.model.geom_size[2, 0] = radius
             run.reset(seed=0)
-            returns.append(sum(run.step(np.zeros(3))[1] for _ in range(2)))
+            returns.append(sum(run.step(np.full(3, 4 * radius))[1] for _ in range(2)))
     before = files_in(tmp_path)
     with served(tmp_path) as view:
         page = pages(view.url)
@@ -543,6 +543,7 @@ def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
             assert page.inner_text("#live-count") == "Complete episodes: 2"
         curve = page.locator("#live-returns")
         low, high = (f"{each:.4g}" for each in sorted(returns))
+        assert low != high
         label = f"Returns of 2 episodes, from {low} to {high}"
         assert curve.get_attribute("aria-label") == label
         heights = {x > 0.5: y for x, y in curve.evaluate(_DOTS)}
