@@ -3,6 +3,7 @@
 
 import base64
 import json
+import logging
 import shutil
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from mjrec.errors import InvalidArgument
 pytest.importorskip("viser")
 from mjrec.viewing.episodes import trajectory_in
 from mjrec.viewing.live import LiveView
+from mjrec.viewing.motion import OWN_LIGHTS
 
 STEPS = 3
 # A falling weight wraps its tendon around a pulley.
@@ -107,8 +109,12 @@ def test_the_episodes_of_an_evaluation_are_listed_together(tmp_path):
     assert advice in str(error.value)
 
 
-def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path):
-    """A page has the shapes of one scene, so it must reload for another."""
+def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path, caplog):
+    """A page has the shapes of one scene, so it must reload for another.
+
+    All of them together log a note once.
+    """
+    caplog.set_level(logging.INFO)
     with begin(tmp_path) as run:
         for radius in (0.05, 0.2):
             run.unwrapped.model.geom_size[2, 0] = radius
@@ -121,6 +127,7 @@ def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path):
             ask(view, "/motion", episode=name)["scene"] for name in names
         )
     assert first == same != other
+    assert caplog.text.count(OWN_LIGHTS) == 1
 
 
 def test_a_page_reloads_once_when_a_tendon_begins_to_wrap(tmp_path):

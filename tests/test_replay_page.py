@@ -2,7 +2,9 @@
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
 import contextlib
+import html
 import io
+import logging
 import re
 import subprocess
 import sys
@@ -25,7 +27,7 @@ pytest.importorskip("viser")
 pytest.importorskip("mjviser")
 from mjrec.viewing.episodes import recorded_episodes
 from mjrec.viewing.geometry import mesh_of
-from mjrec.viewing.motion import Shape
+from mjrec.viewing.motion import OWN_LIGHTS, Shape
 
 _STEPS = 12
 # They have meshes, skins, height fields, tendons, mocap bodies, hundreds of geoms.
@@ -557,7 +559,7 @@ def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
 def test_tendons_and_cloth_have_the_shapes_that_mujoco_computes(pages, tmp_path):
     trajectory = recorded_model(_SOFT, tmp_path, steps=8)
     file = tmp_path / "replay.html"
-    assert mjrec.write_replay(trajectory, file).notes == ()
+    assert mjrec.write_replay(trajectory, file).notes == (OWN_LIGHTS,)
     page = pages(f"{file.as_uri()}#step=8")
     # The page draws the cloth with vertices at zero until its motion is loaded.
     page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)", polling=50)
@@ -621,7 +623,8 @@ def test_states_that_are_not_finite_are_left_out(cheetah, tmp_path):
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
-    assert made.notes == ("States left out because they are not finite: 1 of 13.",)
+    note = "States left out because they are not finite: 1 of 13."
+    assert made.notes == (OWN_LIGHTS, note)
     trajectory.states[:] = np.nan
     with pytest.raises(UnreadableFile, match="none of the states to show is finite"):
         mjrec.write_replay(trajectory, tmp_path / "page.html")
@@ -647,7 +650,8 @@ def test_geoms_change_color_appear_and_vanish_as_in_the_model(tmp_path):
     # Without the reset's state, geom 2 is invisible at first.
     trajectory.states[0] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
-    assert made.notes == ("States left out because they are not finite: 1 of 5.",)
+    note = "States left out because they are not finite: 1 of 5."
+    assert made.notes == (OWN_LIGHTS, note)
     data = data_of(made.path.read_text())
     assert data["rgba"]["/geom/2"][3] == 0
     changes = {name: (at, rgba) for at, name, rgba in data["chunk"]["colours"]}
@@ -666,10 +670,11 @@ def test_the_view_follows_the_first_tree_with_a_joint(tmp_path):
 
 
 def check_note(made, note, caplog):
-    """Check that the result, the log and the page have a note."""
-    assert made.notes == (note,)
-    assert note in caplog.text
-    assert f"<p>{note}</p>" in made.path.read_text()
+    """Check that the result, the log and the page have a note, and the constant one."""
+    assert made.notes == (OWN_LIGHTS, note)
+    for each in made.notes:
+        assert each in caplog.text
+        assert f"<p>{html.escape(each)}</p>" in made.path.read_text()
 
 
 @pytest.mark.parametrize(
@@ -681,12 +686,14 @@ def test_a_note_names_changes_that_are_not_shown(field, kind, tmp_path, caplog):
         if step == 2:
             getattr(env.unwrapped.model, field)[:] *= 2
 
+    caplog.set_level(logging.INFO)
     made = replay_of(record("Hopper-v5", tmp_path, 4, change), tmp_path)
     check_note(made, f"{kind} change during the episode but not on this page.", caplog)
 
 
 def test_a_note_says_that_ropes_are_not_shown(tmp_path, caplog):
     trajectory = recorded_model(_ROPE, tmp_path, steps=2)
+    caplog.set_level(logging.INFO)
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     check_note(made, "One-dimensional flexible bodies are not shown.", caplog)
 
@@ -694,7 +701,7 @@ def test_a_note_says_that_ropes_are_not_shown(tmp_path, caplog):
 def test_a_note_says_that_videos_show_objects_elsewhere(tmp_path):
     """For a video, the environment puts a hand's goal, which falls, in its place."""
     path = record_any("HandManipulateBlock-v1", tmp_path / "run", 1)
-    [note] = replay_of(path, tmp_path).notes
+    _, note = replay_of(path, tmp_path).notes
     assert note.startswith("The videos show some objects in other places")
 
 
