@@ -3,6 +3,7 @@
 
 import base64
 import json
+import logging
 import shutil
 import signal
 import subprocess
@@ -22,7 +23,9 @@ from mjrec.commands import main
 from mjrec.errors import InvalidArgument
 
 pytest.importorskip("viser")
+from mjrec.viewing.episodes import trajectory_in
 from mjrec.viewing.live import LiveView
+from mjrec.viewing.motion import OWN_LIGHTS
 
 STEPS = 3
 # A falling weight wraps its tendon around a pulley.
@@ -83,7 +86,10 @@ def test_new_states_of_a_running_episode_are_served(tmp_path):
 
 
 def test_the_episodes_of_an_evaluation_are_listed_together(tmp_path):
-    """Labels tell their recordings apart, and the newest comes last."""
+    """Labels tell their recordings apart, and the newest comes last.
+
+    `mjrec replay` requests one of the files if several have the number.
+    """
     for seed in (0, 1):
         place = tmp_path / f"Hopper-v5/seed-00{seed}"
         begin(place, uid=f"s{seed}", mode="evaluation").close()
@@ -94,10 +100,21 @@ def test_the_episodes_of_an_evaluation_are_listed_together(tmp_path):
     assert [each["label"] for each in listed["episodes"]] == ["0.s0 0", "0.s1 0"]
     assert newest.startswith("Hopper-v5/seed-001/")
     assert (listed["count"], motion["steps"]) == (2, STEPS)
+    paths = [tmp_path / each["name"] for each in listed["episodes"]]
+    with pytest.raises(InvalidArgument, match="Several monitors") as error:
+        trajectory_in(tmp_path, 0)
+    advice = (
+        f"Instead of the directory, give one of these files: {paths[0]}, {paths[1]}."
+    )
+    assert advice in str(error.value)
 
 
-def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path):
-    """A page has the shapes of one scene, so it must reload for another."""
+def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path, caplog):
+    """A page has the shapes of one scene, so it must reload for another.
+
+    All of them together log a note once.
+    """
+    caplog.set_level(logging.INFO)
     with begin(tmp_path) as run:
         for radius in (0.05, 0.2):
             run.unwrapped.model.geom_size[2, 0] = radius
@@ -110,6 +127,7 @@ def test_episodes_with_other_geom_sizes_have_other_scenes(tmp_path):
             ask(view, "/motion", episode=name)["scene"] for name in names
         )
     assert first == same != other
+    assert caplog.text.count(OWN_LIGHTS) == 1
 
 
 def test_a_page_reloads_once_when_a_tendon_begins_to_wrap(tmp_path):

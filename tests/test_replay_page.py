@@ -2,7 +2,9 @@
 """Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
 
 import contextlib
+import html
 import io
+import logging
 import re
 import subprocess
 import sys
@@ -25,7 +27,7 @@ pytest.importorskip("viser")
 pytest.importorskip("mjviser")
 from mjrec.viewing.episodes import recorded_episodes
 from mjrec.viewing.geometry import mesh_of
-from mjrec.viewing.motion import Shape
+from mjrec.viewing.motion import OWN_LIGHTS, Shape
 
 _STEPS = 12
 # They have meshes, skins, height fields, tendons, mocap bodies, hundreds of geoms.
@@ -121,8 +123,17 @@ _SIZES = """(names) => names.map((name) => {
 _CAMERA = """() => {
   const viewer = window.__viserMutable;
   const inverse = viewer.nodeRefFromName[""].quaternion.clone().invert();
-  return [viewer.camera.position.clone().applyQuaternion(inverse).toArray(),
-    viewer.camera.fov];
+  const place = (vector) => vector.clone().applyQuaternion(inverse).toArray();
+  return [place(viewer.camera.position), viewer.camera.fov,
+    place(viewer.cameraControl.getTarget())];
+}"""
+# Returns the places of the painted pixels, as fractions of the size.
+_DOTS = """(canvas) => {
+  const { width, height } = canvas;
+  const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+  return Array.from({ length: width * height }, (_, at) => at)
+    .filter((at) => data[4 * at + 3])
+    .map((at) => [(at % width) / width, Math.floor(at / width) / height]);
 }"""
 _STEP = "Number(document.getElementById('replay-where').textContent.split(' ')[1])"
 _AFTER_FRAMES = """async (count) => {
@@ -178,6 +189,12 @@ def record(name, directory, steps=_STEPS, change=lambda env, step: None, **optio
             monitor.step(draw())
     [path] = directory.glob("*.h5")
     return path
+
+
+def files_in(directory):
+    """Return the sizes and times of a directory's files."""
+    found = {path: path.stat() for path in (directory, *directory.rglob("*"))}
+    return {path: (each.st_size, each.st_mtime_ns) for path, each in found.items()}
 
 
 def record_any(name, directory, steps=_STEPS):
@@ -307,7 +324,7 @@ def test_geoms_skins_and_free_cameras_are_where_mujoco_has_them(name, pages, tmp
     check_geoms(page, data_at(mjrec.load_trajectory(path), _STEPS))
     shown = data_of(file.read_text())
     if shown["camera"] == "free":
-        position, _ = page.evaluate(_CAMERA)
+        position, *_ = page.evaluate(_CAMERA)
         assert position == pytest.approx(shown["view"]["position"], abs=1e-4)
 
 
@@ -339,7 +356,7 @@ def test_a_model_camera_moves_and_zooms_as_in_videos(page, cheetah):
     page.select_option("#replay-camera", label="track")
     for step, zoomed in ((_STEPS, 30), (_STEPS - 1, 45)):
         data = data_at(trajectory, step)
-        position, fovy = page.evaluate(_CAMERA)
+        position, fovy, _ = page.evaluate(_CAMERA)
         assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
         assert fovy == pytest.approx(zoomed)
         assert f"#step={step}&camera=0&" in page.evaluate("location.hash")
@@ -354,13 +371,13 @@ def test_dragging_orbits_only_the_free_camera(page):
     x, y = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
     for camera, turns in (("0", False), ("free", True)):
         page.select_option("#replay-camera", value=camera)
-        before, _ = page.evaluate(_CAMERA)
+        before, *_ = page.evaluate(_CAMERA)
         page.mouse.move(x, y)
         page.mouse.down()
         page.mouse.move(x + 60, y, steps=4)
         page.mouse.up()
         page.evaluate(_AFTER_FRAMES, 10)
-        after, _ = page.evaluate(_CAMERA)
+        after, *_ = page.evaluate(_CAMERA)
         assert (np.linalg.norm(np.subtract(after, before)) > 0.5) == turns
     # The height is the same.
     assert after[2] == pytest.approx(before[2], abs=0.01)
@@ -388,7 +405,11 @@ def test_bodies_cast_a_shadow_on_the_floor(page):
 
 @pytest.mark.browser
 def test_dragging_the_slider_to_its_middle_shows_the_middle_state(page, cheetah):
+    """The tracking camera moves with the body."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    page.select_option("#replay-camera", label="tracking")
     page.keyboard.press("Home")
+    *_, before = page.evaluate(_CAMERA)
     place = page.locator("#replay-place").bounding_box()
     y = place["y"] + place["height"] / 2
     page.mouse.move(place["x"] + 8, y)
@@ -397,7 +418,15 @@ def test_dragging_the_slider_to_its_middle_shows_the_middle_state(page, cheetah)
     page.mouse.up()
     assert page.evaluate(_STEP) == _STEPS / 2
     assert f"#step={_STEPS // 2}&" in page.evaluate("location.hash")
-    check_geoms(page, data_at(mjrec.load_trajectory(cheetah), _STEPS // 2))
+    data = data_at(trajectory, _STEPS // 2)
+    check_geoms(page, data)
+    moved = (
+        data.body("torso").subtree_com
+        - data_at(trajectory, 0).body("torso").subtree_com
+    )
+    *_, after = page.evaluate(_CAMERA)
+    assert np.abs(moved).max() > 0.01
+    assert np.subtract(after, before) == pytest.approx(moved, abs=1e-4)
 
 
 @pytest.mark.browser
@@ -488,14 +517,18 @@ def test_the_live_view_follows_another_process_and_keeps_all_that_a_kill_leaves(
 
 @pytest.mark.browser
 def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
-    """It does not jump back, even if the page reloads for other geom sizes."""
+    """It does not jump back, even if the page reloads for other geom sizes.
+
+    The page also shows the returns, and viewing leaves the files as they were.
+    """
     env = gymnasium.make("Hopper-v5", max_episode_steps=2)
+    returns = []
     with mjrec.Monitor(env, tmp_path, lambda _: True, workers=0) as run:
         for radius in (0.05, 0.2):
             run.unwrapped.model.geom_size[2, 0] = radius
             run.reset(seed=0)
-            run.step(np.zeros(3))
-            run.step(np.zeros(3))
+            returns.append(sum(run.step(np.full(3, 4 * radius))[1] for _ in range(2)))
+    before = files_in(tmp_path)
     with served(tmp_path) as view:
         page = pages(view.url)
         for number, width in ((1, 0.4), (0, 0.1)):
@@ -510,6 +543,15 @@ def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
             shown = np.reshape(page.evaluate(_VERTICES, "/geom/2"), (-1, 3))
             assert np.ptp(shown, axis=0).min() == pytest.approx(width, rel=0.1)
             assert page.inner_text("#live-count") == "Complete episodes: 2"
+        curve = page.locator("#live-returns")
+        low, high = (f"{each:.4g}" for each in sorted(returns))
+        assert low != high
+        label = f"Returns of 2 episodes, from {low} to {high}"
+        assert curve.get_attribute("aria-label") == label
+        heights = {x > 0.5: y for x, y in curve.evaluate(_DOTS)}
+        assert len(heights) == 2
+        assert (heights[False] > heights[True]) == (returns[0] < returns[1])
+    assert files_in(tmp_path) == before
 
 
 @pytest.mark.browser
@@ -517,7 +559,7 @@ def test_the_live_view_shows_the_chosen_episode(pages, tmp_path):
 def test_tendons_and_cloth_have_the_shapes_that_mujoco_computes(pages, tmp_path):
     trajectory = recorded_model(_SOFT, tmp_path, steps=8)
     file = tmp_path / "replay.html"
-    assert mjrec.write_replay(trajectory, file).notes == ()
+    assert mjrec.write_replay(trajectory, file).notes == (OWN_LIGHTS,)
     page = pages(f"{file.as_uri()}#step=8")
     # The page draws the cloth with vertices at zero until its motion is loaded.
     page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)", polling=50)
@@ -564,13 +606,25 @@ def test_the_command_writes_the_episode_of_a_number(cheetah, tmp_path, capsys):
     assert "Available: 0." in capsys.readouterr().err
 
 
+def test_the_command_writes_the_episode_of_a_file(cheetah, tmp_path, capsys):
+    """A number is refused, as a file has one episode."""
+    page = tmp_path / "page.html"
+    command = ["replay", str(cheetah), "--out", str(page)]
+    assert main([*command, "--episode", "0"]) == 1
+    assert "single episode. Omit --episode" in capsys.readouterr().err
+    assert not page.exists()
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith(f"{page}: 13 states, ")
+
+
 def test_states_that_are_not_finite_are_left_out(cheetah, tmp_path):
     """Without any finite state, nothing is written."""
     trajectory = mjrec.load_trajectory(cheetah)
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
-    assert made.notes == ("States left out because they are not finite: 1 of 13.",)
+    note = "States left out because they are not finite: 1 of 13."
+    assert made.notes == (OWN_LIGHTS, note)
     trajectory.states[:] = np.nan
     with pytest.raises(UnreadableFile, match="none of the states to show is finite"):
         mjrec.write_replay(trajectory, tmp_path / "page.html")
@@ -596,7 +650,8 @@ def test_geoms_change_color_appear_and_vanish_as_in_the_model(tmp_path):
     # Without the reset's state, geom 2 is invisible at first.
     trajectory.states[0] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
-    assert made.notes == ("States left out because they are not finite: 1 of 5.",)
+    note = "States left out because they are not finite: 1 of 5."
+    assert made.notes == (OWN_LIGHTS, note)
     data = data_of(made.path.read_text())
     assert data["rgba"]["/geom/2"][3] == 0
     changes = {name: (at, rgba) for at, name, rgba in data["chunk"]["colours"]}
@@ -615,10 +670,11 @@ def test_the_view_follows_the_first_tree_with_a_joint(tmp_path):
 
 
 def check_note(made, note, caplog):
-    """Check that the result, the log and the page have a note."""
-    assert made.notes == (note,)
-    assert note in caplog.text
-    assert f"<p>{note}</p>" in made.path.read_text()
+    """Check that the result, the log and the page have a note, and the constant one."""
+    assert made.notes == (OWN_LIGHTS, note)
+    for each in made.notes:
+        assert each in caplog.text
+        assert f"<p>{html.escape(each)}</p>" in made.path.read_text()
 
 
 @pytest.mark.parametrize(
@@ -630,12 +686,14 @@ def test_a_note_names_changes_that_are_not_shown(field, kind, tmp_path, caplog):
         if step == 2:
             getattr(env.unwrapped.model, field)[:] *= 2
 
+    caplog.set_level(logging.INFO)
     made = replay_of(record("Hopper-v5", tmp_path, 4, change), tmp_path)
     check_note(made, f"{kind} change during the episode but not on this page.", caplog)
 
 
 def test_a_note_says_that_ropes_are_not_shown(tmp_path, caplog):
     trajectory = recorded_model(_ROPE, tmp_path, steps=2)
+    caplog.set_level(logging.INFO)
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     check_note(made, "One-dimensional flexible bodies are not shown.", caplog)
 
@@ -643,7 +701,7 @@ def test_a_note_says_that_ropes_are_not_shown(tmp_path, caplog):
 def test_a_note_says_that_videos_show_objects_elsewhere(tmp_path):
     """For a video, the environment puts a hand's goal, which falls, in its place."""
     path = record_any("HandManipulateBlock-v1", tmp_path / "run", 1)
-    [note] = replay_of(path, tmp_path).notes
+    _, note = replay_of(path, tmp_path).notes
     assert note.startswith("The videos show some objects in other places")
 
 

@@ -74,8 +74,8 @@ def trajectory_in(target: Path, episode: int | None) -> Path:
             f"{', '.join(known[:_SHOWN])}{' ...' if len(known) > _SHOWN else ''}."
         )
     if len(those) > 1:
-        names = ", ".join(path.name for path in those[:_SHOWN])
         raise InvalidArgument(
-            f"Several monitors have an episode {episode}. Choose one of {names}."
+            f"Several monitors have an episode {episode}. Instead of the directory, "
+            f"give one of these files: {', '.join(map(str, those[:_SHOWN]))}."
         )
     return those[0]

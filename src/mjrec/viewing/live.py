@@ -37,7 +37,14 @@ from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
 from .geometry import linear
 from .motion import FIXED_FIELDS, Shape, Stage
-from .replay import are_finite, ending_of, motion_chunk, replay_page, title_of
+from .replay import (
+    are_finite,
+    ending_of,
+    log_notes,
+    motion_chunk,
+    replay_page,
+    title_of,
+)
 
 _ADDRESS = "127.0.0.1"
 # Limits of one response; a page requests the rest later.
@@ -96,6 +103,7 @@ class LiveView:
         self._directory = path
         self._trust_models = trust_models
         self._shown: _Shown | None = None
+        self._logged: set[str] = set()
         # A page needs a node for whatever appears in any state, such as each segment
         # of a tendon, so all stages of a scene share what has been seen.
         self._passing: dict[str, dict[str, Shape]] = {}
@@ -244,6 +252,9 @@ class LiveView:
             motion = shown.stage.motion(trajectory, steps)
             told["start"] = motion.target[0].tolist()
             told["chunk"] = motion_chunk(motion, keep_all=True)
+        notes = [n for n in shown.stage.notes if n not in self._logged]
+        log_notes(trajectory.path, notes)
+        self._logged.update(notes)
         return {**told, "scene": shown.scene_id}
 
     def _name(self, path: Path) -> str:

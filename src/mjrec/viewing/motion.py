@@ -35,6 +35,10 @@ _TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
 _FIXED_CAMERA = int(mujoco.mjtCamera.mjCAMERA_FIXED)
 _TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _SKIN, _FLEX = int(mujoco.mjtGeom.mjGEOM_SKIN), int(mujoco.mjtGeom.mjGEOM_FLEX)
+# A note of every page.
+OWN_LIGHTS = (
+    "The page has its own lights; the model's lights and reflections are not shown."
+)
 # Fields whose changes a page does not show.
 _FIXED = {
     "Sizes and meshes": (
@@ -131,7 +135,7 @@ class Stage:
         self.model = trajectory.model()
         self.data = mujoco.MjData(self.model)
         self.passing: dict[str, Shape] = {}
-        self.notes: list[str] = []
+        self.notes = [OWN_LIGHTS]
         self._camera, self._option = _recorded_view(trajectory, self.model)
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MOST_GEOMS)
         self._changes_seen = 0

@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -27,7 +27,7 @@ from ..errors import UnreadableFile
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.trajectories import Trajectory
 from .geometry import linear, scene_page
-from .motion import Motion, Stage
+from .motion import OWN_LIGHTS, Motion, Stage
 
 _LOG = logging.getLogger(__name__)
 _COMPRESSION = 6
@@ -68,6 +68,8 @@ def write_replay(
     The page is a single file and needs no network. It shows the same geometry as the
     videos, with rewards, in all recorded states, from any direction and from the
     model's cameras. It is only a view of the recorded states, not separate evidence.
+    It stores positions as float32, so they equal the recorded ones to 1e-5 only
+    within about 100 m of the origin.
 
     Args:
         trajectory: the episode, from `load_trajectory`.
@@ -93,8 +95,7 @@ def write_replay(
             "States left out because they are not finite: "
             f"{left} of {len(trajectory.states)}."
         )
-    for note in stage.notes:
-        _LOG.warning("%s: %s", trajectory.path.name, note)
+    log_notes(trajectory.path, stage.notes)
     page = replay_page(trajectory, stage, motion)
     write_text(Path(path), page)
     return Replay(
@@ -103,6 +104,14 @@ def write_replay(
         size=len(page.encode()),
         notes=tuple(stage.notes),
     )
+
+
+def log_notes(path: Path, notes: Iterable[str]) -> None:
+    """Log remarks on features of a trajectory that its page does not show."""
+    for note in notes:
+        # This one is true of every page, so it is no warning.
+        level = logging.INFO if note == OWN_LIGHTS else logging.WARNING
+        _LOG.log(level, "%s: %s", path.name, note)
 
 
 def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int64]:
