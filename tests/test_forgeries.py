@@ -1244,7 +1244,8 @@ OTHERS = {
         for what, (lie, line) in IMPOSSIBLE.items()
     },
     "an option that no reset can be given, of a killed recording": (
-        *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION), "of a reset"),
+        *(honest.killed, methodcaller("say", 1, options=NO_PLAIN_OPTION)),
+        "the reset options",
     ),
     "actions called float64": (honest.cheetah, each(3, call_it_double), r"0\.reward"),
     "the best called the worst": (best, replaced("best:1", "worst:1"), r"2\.recording"),
