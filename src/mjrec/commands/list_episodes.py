@@ -21,7 +21,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
-from .not_finite import not_finite_lines
+from .not_finite import name_of, not_finite_lines
 from .options import AsJson
 from .terminal import print_json, print_rows, printable
 
@@ -139,7 +139,7 @@ def _print_monitors(directory: Path, not_finite: list[str]) -> None:
     def rows() -> _Rows:
         for episode in iter_episodes(directory):
             if not math.isfinite(episode.reward):
-                not_finite.append(f"{directory.name} episode {episode.episode_id}")
+                not_finite.append(name_of(directory, episode))
             elif not best or episode.reward > best[0].reward:
                 best[:] = [episode]
             further = _further_videos(episode)

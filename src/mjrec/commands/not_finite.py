@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import Error
 from ..formats.monitor_directory import recording_directories
 from ..plain_text import counted, listed
-from ..results import iter_episodes
+from ..results import Episode, iter_episodes
 from .terminal import printable
 
 # Follows the number of returns where the option exists.
@@ -29,12 +29,17 @@ def not_finite_lines(names: Sequence[str], more: str = "") -> list[str]:
     return [f"NaN or infinite: {which}"] * bool(names)
 
 
+def name_of(directory: Path, episode: Episode) -> str:
+    """Return the name for people of an episode in a monitor directory."""
+    return f"{directory.name} episode {episode.episode_id}"
+
+
 def not_finite_in(directory: Path) -> list[str]:
     """Return the names of a directory's episodes whose return is NaN or infinite."""
     # A command has already shown the files that cannot be read.
     with contextlib.suppress(Error):
         return [
-            f"{place.name} episode {each.episode_id}"
+            name_of(place, each)
             for place in recording_directories(directory)
             for each in iter_episodes(place)
             if not math.isfinite(each.reward)

@@ -217,8 +217,9 @@ def text_differences(
         rules: the rules of the comparison.
         **place: `where` and `episode` of `json_differences`.
     """
-    one, other = json_object(rules.translated(given)), json_object(made)
-    if not _is_plain(rules.translated(given), one) and _is_plain(made, other):
+    text = rules.translated(given)
+    one, other = json_object(text), json_object(made)
+    if not _is_plain(text, one) and _is_plain(made, other):
         # Spaces and needless digits could say anything.
         how = "it is not written as mjrec writes it"
         yield Difference(rules.usual, how=how, where=place.get("where", ""))

@@ -3,27 +3,7 @@
 
 from __future__ import annotations
 
-import importlib
-
-from ..errors import MissingDependency
 from ..recorder.tracking import FinishedEpisode, FinishedVideo
-
-
-def require(package: str, *, purpose: str) -> None:
-    """Import a service's package, which has the same name as mjrec's extra for it.
-
-    Raises:
-        MissingDependency: the package is not installed.
-    """
-    try:
-        importlib.import_module(package)
-    except ModuleNotFoundError as error:
-        # The package itself is installed, but one of its dependencies is missing.
-        if error.name != package:
-            raise
-        raise MissingDependency(
-            package, purpose=purpose, install=f'pip install "mjrec[{package}]"'
-        ) from error
 
 
 def group_of(episode: FinishedEpisode | None) -> str:

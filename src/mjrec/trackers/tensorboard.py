@@ -11,11 +11,12 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import optional_module
 from ..formats.ffmpeg import run_ffmpeg
 from ..formats.json_fields import field, integer, read_object, text, unreadable
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from ..worker_thread import WorkerThread
-from .services import group_of, name_of, require, scalars_of
+from .services import group_of, name_of, scalars_of
 
 if TYPE_CHECKING:
     from .event_file import EventFile
@@ -56,7 +57,9 @@ class TensorBoardTracker(Tracker):
     """
 
     def __init__(self, log_dir: str | os.PathLike[str] | None = None) -> None:
-        require("tensorboard", purpose="TensorBoardTracker")
+        optional_module(
+            "tensorboard", purpose="TensorBoardTracker", install="mjrec[tensorboard]"
+        )
         # Absolute, because the working directory may change before the path is used.
         self._log_dir = None if log_dir is None else Path(log_dir).absolute()
         self._files: dict[Run, EventFile] = {}

@@ -6,9 +6,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, optional_module
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
-from .services import group_of, name_of, require, scalars_of
+from .services import group_of, name_of, scalars_of
 
 _STEPS = "total_steps"
 _VIDEO_STEPS = "video_total_steps"
@@ -50,7 +50,7 @@ class WandbTracker(Tracker):
         mode: str | None = None,
         **init: Any,
     ) -> None:
-        require("wandb", purpose="WandbTracker")
+        optional_module("wandb", purpose="WandbTracker", install="mjrec[wandb]")
         named = {"project": project, "mode": mode}
         self._init = {k: v for k, v in named.items() if v is not None} | init
         if run is not None and self._init:
